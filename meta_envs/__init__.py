@@ -1,0 +1,33 @@
+"""Meta-environments: families of tasks with fixed train/test splits, on Gymnasium's interface.
+
+After `import meta_envs`, `gymnasium.make("PointRobotWind-v0", task=3)` makes task 3, and
+`gymnasium.make_vec("PointRobotWind-v0", vectorization_mode="vector_entry_point", tasks=[3, 5])`
+makes one sub-environment a task.
+"""
+
+import gymnasium
+
+from meta_envs.env import MetaEnv, MetaVectorEnv
+from meta_envs.registry import ENVIRONMENTS, resolve, task_set
+from meta_envs.scores import normalized_score, reference_returns
+from meta_envs.tasks import TaskSet
+
+__all__ = [
+    "ENVIRONMENTS",
+    "MetaEnv",
+    "MetaVectorEnv",
+    "TaskSet",
+    "normalized_score",
+    "reference_returns",
+    "resolve",
+    "task_set",
+]
+
+for _row in ENVIRONMENTS.values():
+    gymnasium.register(
+        id=_row.id,
+        entry_point="meta_envs.env:MetaEnv",
+        vector_entry_point="meta_envs.env:MetaVectorEnv",
+        max_episode_steps=_row.horizon,
+        kwargs={"name": _row.name},
+    )
