@@ -29,8 +29,8 @@ class Definition(ABC):
     """Short name, as in the registry."""
     horizon: ClassVar[int]
     """Steps until an episode is truncated."""
-    observation_space: Box
-    action_space: Box
+    observation_space: Box[np.float32]
+    action_space: Box[np.float32]
     controllers: Mapping[str, Controller] = {}
     """Reference controllers, (states, params) -> actions; `oracle` is the exact optimum."""
     sparse: ClassVar[bool] = False
@@ -56,7 +56,10 @@ class Definition(ABC):
     def reward(
         self, state: Floats, action: Floats, next_state: Floats, params: Floats
     ) -> tuple[Floats, Terms]:
-        """Rewards [n] and their terms, a dict of arrays [n] that `info` carries every step."""
+        """Rewards [n] and their terms, a dict of arrays [n] that `info` carries every step.
+
+        All of them are fresh arrays that the caller may write to, and no two share memory.
+        """
 
     @abstractmethod
     def terminated(self, state: Floats) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from meta_envs.definition import Definition, Floats, Terms
+from meta_envs.draw import draw_point_robot
 from meta_envs.tasks import TaskSet, interleaved_test_tasks
 
 SPEED = 0.1
@@ -18,6 +19,9 @@ GOAL_RADIUS = 0.2
 """Within this distance of the goal a step counts as a success."""
 MAX_WIND = 0.05
 """Largest wind on each axis, distance a step."""
+WIND_GOAL = np.array([[1.0, 0.0]])
+"""Goal of every task with wind, [1, 2]."""
+WIND_GOAL.setflags(write=False)
 
 
 def _sample_goals(generator: np.random.Generator, n_tasks: int) -> Floats:
@@ -64,7 +68,7 @@ class PointRobot(Definition):
         return TaskSet(self.name, self.param_names, params, test_tasks, sampler)
 
     def goal(self, params: Floats) -> Floats:
-        """Goals [n, 2] of tasks [n, P]."""
+        """Goals of tasks [n, P]: [n, 2], or [1, 2] if it is one goal for all."""
         return params
 
     def wind(self, params: Floats) -> Floats | None:
@@ -76,20 +80,25 @@ class PointRobot(Definition):
         return np.zeros((len(generators), 2))
 
     def advance(self, state: Floats, action: Floats, params: Floats) -> Floats:
-        """s' = s + 0.1 a + wind."""
-        moved = state + SPEED * action
+        """The position moves by 0.1 a + wind."""
+        moved = SPEED * action
+        moved += state
         wind = self.wind(params)
-        return moved if wind is None else moved + wind
+        return moved if wind is None else np.add(moved, wind, out=moved)
 
     def observe(self, state: Floats) -> NDArray[np.float32]:
         """The position."""
         return state.astype(np.float32)
 
     def _distance(self, state: Floats, params: Floats) -> Floats:
-        offset = state - self.goal(params)
-        offset *= offset
+        goal = self.goal(params)
         # Not a norm or a dot product: those may round differently from one batch size to another.
-        return np.sqrt(offset[:, 0] + offset[:, 1])
+        square = state[:, 0] - goal[:, 0]
+        square *= square
+        side = state[:, 1] - goal[:, 1]
+        side *= side
+        square += side
+        return np.sqrt(square, out=square)
 
     def reward(
         self, state: Floats, action: Floats, next_state: Floats, params: Floats
@@ -114,8 +123,6 @@ class PointRobot(Definition):
 
     def render(self, path: Floats, params: Floats) -> NDArray[np.uint8]:
         """Robot, path, goal with its success radius, and wind."""
-        from meta_envs.draw import draw_point_robot
-
         row = params[None]
         wind = self.wind(row)
         return draw_point_robot(
@@ -141,14 +148,14 @@ class PointRobotWind(PointRobot):
     def tasks(self) -> TaskSet:
         """Winds uniform in a square: seed 1337, all x components first, then all y."""
         # The field's published table comes from this legacy stream, so it cannot be a Generator.
-        stream = np.random.RandomState(1337)  # noqa: NPY002
+        stream = np.random.RandomState(1337)
         n_tasks = self.n_train + self.n_test
         x, y = (stream.uniform(-MAX_WIND, MAX_WIND, n_tasks) for _ in range(2))
         return self._task_set(np.stack([x, y], axis=1))
 
     def goal(self, params: Floats) -> Floats:
         """Always (1, 0)."""
-        return np.array([[1.0, 0.0]])
+        return WIND_GOAL
 
     def wind(self, params: Floats) -> Floats:
         """The task itself."""
@@ -170,5 +177,6 @@ class SparsePointRobot(PointRobot):
     ) -> tuple[Floats, Terms]:
         """The sparse reward; its terms hold the dense one."""
         dense, terms = super().reward(state, action, next_state, params)
-        sparse = np.maximum(1.0 + dense / GOAL_RADIUS, 0.0)
-        return sparse, {**terms, "dense_reward": dense}
+        sparse = dense / GOAL_RADIUS
+        sparse += 1.0
+        return np.maximum(sparse, 0.0, out=sparse), {**terms, "dense_reward": dense}

@@ -46,7 +46,7 @@ def reference_returns(
         return generator.uniform(-1.0, 1.0, shape)
 
     many = MetaVectorEnv(tasks.env, tasks=np.repeat(rows, episodes), task_set=tasks)
-    shape = (many.num_envs, *many.single_action_space.shape)
+    shape = (many.num_envs, *many.definition.action_space.shape)
     found = {"random": _episode_returns(many, uniform).reshape(len(tasks), episodes).mean(axis=1)}
     for name, controller in many.definition.controllers.items():
         one = MetaVectorEnv(tasks.env, tasks=rows, task_set=tasks)
@@ -63,6 +63,11 @@ def normalized_score(
         episode_return: returns R, any shape.
         random: return of the random policy on the same tasks.
         expert: return of the expert on the same tasks.
+
+    Returns:
+        float64, of the shape the three broadcast to; NaN where the expert is no better than the
+        random policy, since there is no scale then.
     """
     low, high = np.asarray(random, np.float64), np.asarray(expert, np.float64)
-    return np.asarray(100.0 * (np.asarray(episode_return, np.float64) - low) / (high - low))
+    scale = np.where(high > low, high - low, np.nan)
+    return np.asarray(100.0 * (np.asarray(episode_return, np.float64) - low) / scale)

@@ -26,9 +26,13 @@ class TaskSet:
     Attributes:
         env: short name of the environment the tasks belong to.
         param_names: what each parameter is, P names.
-        params: float64 [n_tasks, P], one row a task, read-only.
-        test_tasks: int64 [n_test], sorted rows of the meta-test tasks; all others are for training.
+        params: float64 [n_tasks, P], one row a task, a read-only copy of what was given.
+        test_tasks: int64 [n_test], sorted rows of the meta-test tasks, a read-only copy; all others
+            are for training.
         sampler: draws n fresh rows from the distribution the tasks come from.
+
+    Raises:
+        ValueError: params of another shape or not finite; test tasks unsorted or out of range.
     """
 
     env: str
@@ -38,14 +42,23 @@ class TaskSet:
     sampler: Sampler = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Check the shapes and make the arrays read-only."""
-        if self.params.ndim != 2 or self.params.shape[1] != len(self.param_names):
+        """Check the contents and keep read-only copies of the arrays."""
+        params = np.array(self.params, dtype=np.float64)
+        if params.ndim != 2 or params.shape[1] != len(self.param_names):
             raise ValueError(
-                f"{self.env}: params must be [n_tasks, {len(self.param_names)}], "
-                f"got {self.params.shape}"
+                f"{self.env}: params must be [n_tasks, {len(self.param_names)}], got {params.shape}"
             )
-        self.params.setflags(write=False)
-        self.test_tasks.setflags(write=False)
+        if not np.isfinite(params).all():
+            raise ValueError(f"{self.env}: params must be finite")
+        rows = np.array(self.test_tasks, dtype=np.int64)
+        inside = (rows >= 0) & (rows < len(params))
+        if rows.ndim != 1 or not inside.all() or (np.diff(rows) <= 0).any():
+            raise ValueError(
+                f"{self.env}: test_tasks must be sorted rows between 0 and {len(params) - 1}"
+            )
+        for name, array in (("params", params), ("test_tasks", rows)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     def __len__(self) -> int:
         """Number of tasks."""
@@ -83,10 +96,15 @@ class TaskSet:
 
         Args:
             n_tasks: how many, at least 1.
-            seed: of a private generator; the same seed gives the same tasks.
+            seed: of a private generator, non-negative; the same seed gives the same tasks.
+
+        Raises:
+            ValueError: either argument out of range.
         """
-        if n_tasks < 1:
-            raise ValueError(f"{self.env}: n_tasks must be at least 1, got {n_tasks}")
+        for name, value, least in (("n_tasks", n_tasks, 1), ("seed", seed, 0)):
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+                raise ValueError(
+                    f"{self.env}: {name} must be an integer of at least {least}, got {value!r}"
+                )
         params = self.sampler(np.random.default_rng(seed), n_tasks)
-        every = np.arange(n_tasks, dtype=np.int64)
-        return TaskSet(self.env, self.param_names, params, every, self.sampler)
+        return TaskSet(self.env, self.param_names, params, np.arange(n_tasks), self.sampler)

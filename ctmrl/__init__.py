@@ -1,0 +1,1 @@
+"""Offline meta-reinforcement learning with cross-task contexts (CTMRL), and its relatives."""

@@ -1,0 +1,92 @@
+"""The codebook of CQ-VAE: codes, their moving update, and K-means that places them."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ctmrl.cqvae import cosine, match, moving_update
+
+
+def kmeans(contexts: Tensor, n_codes: int, seed: int) -> Tensor:
+    """Cluster contexts by direction, the metric codes are matched by.
+
+    Args:
+        contexts: [n, Z], n >= n_codes.
+        n_codes: N.
+        seed: of the initial centres.
+
+    Returns:
+        [N, Z]: the mean of each cluster's contexts (not of their directions, because a code also
+        stands in for its contexts in the predictors).
+    """
+    # Imported here: it takes a second, and only runs that use K-means need it.
+    from sklearn.cluster import KMeans
+    from sklearn.exceptions import ConvergenceWarning
+
+    directions = functional.normalize(contexts, dim=1, eps=1e-6).numpy().astype(np.float64)
+    with warnings.catch_warnings():
+        # Fewer distinct contexts than codes: the surplus centres repeat others, which is right.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        labels = KMeans(n_codes, n_init=4, random_state=seed).fit_predict(directions)
+    found = torch.from_numpy(labels).long()
+    counts = torch.bincount(found, minlength=n_codes)
+    sums = torch.zeros(n_codes, contexts.shape[1]).index_add_(0, found, contexts)
+    means = sums / counts.clamp_min(1)[:, None]
+    fallback = contexts[torch.arange(n_codes) % len(contexts)]
+    return torch.where(counts[:, None] > 0, means, fallback)
+
+
+class Codebook(nn.Module):
+    """N codes of size Z, a parameter that Equation (2) moves and the losses' gradients refine."""
+
+    placed: Tensor
+
+    def __init__(self, n_codes: int, z_dim: int, generator: torch.Generator) -> None:
+        """Start from random unit vectors; K-means places them later, unless it is switched off."""
+        super().__init__()
+        start = functional.normalize(torch.randn(n_codes, z_dim, generator=generator), dim=1)
+        self.codes = nn.Parameter(start)
+        self.register_buffer("placed", torch.zeros((), dtype=torch.bool))
+
+    def match(self, contexts: Tensor) -> Tensor:
+        """Equation (1): index of each context's code, int64 [B]."""
+        return match(contexts.detach(), self.codes.detach())
+
+    @torch.no_grad()
+    def update(self, contexts: Tensor, matched: Tensor, eta: float) -> None:
+        """Equation (2), in place."""
+        self.codes.copy_(moving_update(self.codes, contexts, matched, eta))
+
+    @torch.no_grad()
+    def place(self, contexts: Tensor, seed: int) -> None:
+        """Put the codes at the K-means centres of collected contexts [n, Z]."""
+        self.codes.copy_(kmeans(contexts, len(self.codes), seed))
+        self.placed.fill_(True)
+
+    @torch.no_grad()
+    def refresh(self, contexts: Tensor, eta: float, seed: int) -> None:
+        """Cluster collected contexts [n, Z] and move the codes towards the centres.
+
+        Each centre is matched and moves its code by Equations (1) and (2). A code that none of the
+        contexts matches is dead; it takes the place of a centre that is farthest from its own code.
+        """
+        centres = kmeans(contexts, len(self.codes), seed)
+        self.update(centres, self.match(centres), eta)
+        used = torch.bincount(self.match(contexts), minlength=len(self.codes)) > 0
+        dead = torch.nonzero(~used)[:, 0]
+        if len(dead):
+            nearest = cosine(centres, self.codes[used]).max(dim=1).values
+            lonely = nearest.argsort(stable=True)[: len(dead)]
+            self.codes[dead[: len(lonely)]] = centres[lonely]
+
+
+def perplexity(matched: Tensor, n_codes: int) -> Tensor:
+    """How many codes are in use, exp of the entropy of the assignment; 1 to N."""
+    share = torch.bincount(matched, minlength=n_codes) / len(matched)
+    found: Tensor = torch.special.entr(share).sum().exp()
+    return found

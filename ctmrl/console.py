@@ -1,0 +1,121 @@
+"""What the learners' commands show on a terminal."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ctmrl.errors import UsageError
+from datagen.dataset import DatasetError
+
+
+def run_command(command: Callable[[], None]) -> int:
+    """Run a command; a user's mistake becomes one sentence on stderr.
+
+    Returns:
+        The exit code: 0, 2 for a mistake, 130 for Ctrl-C.
+    """
+    try:
+        command()
+    except KeyboardInterrupt:
+        sys.stderr.write("Stopped. The same command goes on from the last checkpoint.\n")
+        return 130
+    except (UsageError, DatasetError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    return 0
+
+
+class TrainingDisplay:
+    """Live metrics on a terminal; a line every tenth of the run elsewhere."""
+
+    def __init__(self, console: Console, steps: int, start: int, n_codes: int | None) -> None:
+        """Set up.
+
+        Args:
+            console: where to show it.
+            steps: of the whole run.
+            start: steps already taken.
+            n_codes: size of the codebook, None for a method without one.
+        """
+        self.console, self.steps, self.start, self.n_codes = console, steps, start, n_codes
+        self._begun = time.monotonic()
+        self._progress = Progress(
+            TextColumn("meta-training"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[rate]:.0f} steps/s"),
+            TimeRemainingColumn(),
+            console=console,
+        )
+        self._bar = self._progress.add_task("", total=steps, completed=start, rate=0.0)
+        self._live = Live(self._progress, console=console) if console.is_terminal else None
+        self._return: float | None = None
+
+    def __enter__(self) -> TrainingDisplay:
+        """Start the live table, on a terminal."""
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop the live table."""
+        if self._live:
+            self._live.stop()
+
+    def show(self, metrics: Mapping[str, float | None]) -> None:
+        """Show a row of metrics."""
+        step = int(metrics["step"] or 0)
+        self._return = metrics["return/training_tasks"] or self._return
+        elapsed = max(time.monotonic() - self._begun, 1e-6)
+        rate = (step - self.start) / elapsed
+        if self._live:
+            self._progress.update(self._bar, completed=step, rate=rate)
+            grid = Table.grid()
+            grid.add_row(self._progress)
+            grid.add_row(self._table(metrics))
+            self._live.update(grid)
+        elif metrics["return/training_tasks"] is not None:
+            left = (self.steps - step) / max(rate, 1e-6)
+            self.console.print(
+                f"step {step}/{self.steps}: {self._losses(metrics)}; {self._usage(metrics)}"
+                f"return on training tasks {self._return:.2f}; "
+                f"{elapsed:.0f} s, about {left:.0f} s left",
+                soft_wrap=True,
+                highlight=False,
+            )
+
+    @staticmethod
+    def _losses(metrics: Mapping[str, float | None]) -> str:
+        shown = {
+            key.removeprefix("loss/").replace("encoder/", ""): value
+            for key, value in metrics.items()
+            if key.startswith("loss/")
+        }
+        return ", ".join(f"{key} {value:.3g}" for key, value in shown.items())
+
+    def _usage(self, metrics: Mapping[str, float | None]) -> str:
+        if self.n_codes is None:
+            return ""
+        return f"codes in use {metrics['codes/perplexity']:.1f} of {self.n_codes}; "
+
+    def _table(self, metrics: Mapping[str, float | None]) -> Table:
+        table = Table(box=None, show_header=False, padding=(0, 2))
+        for key, value in metrics.items():
+            if key == "return/training_tasks":
+                value = self._return
+            if key != "step":
+                table.add_row(key, "-" if value is None else f"{value:.4f}")
+        return table

@@ -1,0 +1,154 @@
+"""`python -m ctmrl.evaluate RUN`: meta-test a stored run, on its own tasks or on fresh ones."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ctmrl.agent import Agent
+    from ctmrl.config import RunConfig
+    from meta_envs import TaskSet
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Repeat the meta-test of a stored run, or run it on tasks nobody could have trained on."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder, such as runs/point_robot_wind/ctmrl/seed-0."""
+    fresh: int = 0
+    """Instead of the dataset's tasks, this many fresh ones from the same distribution."""
+    seed: int | None = None
+    """Of exploration, and of the fresh tasks; the run's own seed by default."""
+    out: Path | None = None
+    """Also write the result as JSON and both pictures into this folder."""
+    repetitions: int | None = field(default=None)
+    """Independent adaptations of each task; the run's own number by default."""
+
+
+def evaluate_agent(
+    agent: Agent,
+    config: RunConfig,
+    tasks: TaskSet,
+    groups: dict[str, NDArray[np.int64]],
+    best_behavior: dict[int, float],
+    seed: int,
+) -> dict[str, Any]:
+    """Meta-test an agent.
+
+    Args:
+        agent: encoder and actor.
+        config: of its run; the protocol is in it.
+        tasks: the task set.
+        groups: rows of it by name, such as `unseen` and `seen`.
+        best_behavior: return of each task's best behaviour policy, where known.
+        seed: of the exploration.
+
+    Returns:
+        What evaluation.json holds; returns are undiscounted sums, means where not said otherwise.
+    """
+    import torch
+
+    from ctmrl.meta_test import meta_test
+    from meta_envs import normalized_score, reference_returns
+
+    references = reference_returns(tasks)
+    record: dict[str, Any] = {
+        "env": config.env,
+        "method": config.method,
+        "seed": config.seed,
+        "evaluation_seed": seed,
+        "protocol": {
+            "random_episodes": config.meta_test.random_episodes,
+            "policy_episodes": config.meta_test.policy_episodes,
+            "scored_episodes": config.meta_test.scored_episodes,
+            "repetitions": config.meta_test.repetitions,
+        },
+        "param_names": list(tasks.param_names),
+        "groups": {},
+    }
+    for name, rows in groups.items():
+        result = meta_test(agent.method.encoder, agent.actor, tasks, rows, config.meta_test, seed)
+        anchors = {key: float(values[rows].mean()) for key, values in references.items()}
+        if best_behavior and all(int(row) in best_behavior for row in rows):
+            best = [best_behavior[int(row)] for row in rows]
+            anchors["best_behavior"] = sum(best) / len(best)
+        expert = anchors.get("oracle", anchors.get("best_behavior"))
+        value = float(result.returns.mean())
+        contexts = torch.from_numpy(result.contexts.mean(axis=0))
+        codes = agent.method.code_of(contexts)
+        record["groups"][name] = {
+            "tasks": rows.tolist(),
+            "params": tasks.params[rows].tolist(),
+            "return": value,
+            "score": None
+            if expert is None
+            else float(normalized_score(value, anchors["random"], expert)),
+            "task_returns": result.returns.mean(axis=0).tolist(),
+            "repetition_returns": result.returns.mean(axis=1).tolist(),
+            "curve": result.curve.tolist(),
+            "references": anchors,
+            "contexts": contexts.tolist(),
+            "codes": None if codes is None else codes.tolist(),
+        }
+    return record
+
+
+def main(config: EvaluateConfig) -> None:
+    """Evaluate and print."""
+    import dataclasses
+
+    import numpy as np
+    from rich.console import Console
+
+    from ctmrl import runs
+    from ctmrl.agent import load_agent
+    from ctmrl.files import write_whole
+    from ctmrl.methods.base import Dimensions
+    from ctmrl.presets import config_from_settings
+    from ctmrl.report import result_table, write_pictures
+    from ctmrl.threads import settle_threads
+    from meta_envs import task_set
+
+    stored = runs.read_json(config.run / runs.CONFIG)
+    run_config = config_from_settings(stored, config.run / runs.CONFIG)
+    if config.repetitions is not None:
+        protocol = dataclasses.replace(run_config.meta_test, repetitions=config.repetitions)
+        run_config = dataclasses.replace(run_config, meta_test=protocol)
+    settle_threads(run_config.threads)
+    dims = Dimensions(*(stored["dimensions"][name] for name in Dimensions._fields))
+    state = runs.load_checkpoint(config.run / runs.CHECKPOINT)
+    agent = load_agent(run_config, dims, state)
+    if int(state["step"]) < dims.steps:
+        raise runs.RunError(
+            f"{config.run} stopped at step {int(state['step'])} of {dims.steps}: "
+            "give its training command again to finish it"
+        )
+    seed = run_config.seed if config.seed is None else config.seed
+    tasks = task_set(run_config.env)
+    if config.fresh:
+        tasks = tasks.sample(config.fresh, seed)
+        groups, best = {"fresh": np.arange(config.fresh)}, {}
+    else:
+        groups = {name: np.array(rows) for name, rows in stored["groups"].items()}
+        best = {int(task): value for task, value in stored["best_behavior"].items()}
+    record = evaluate_agent(agent, run_config, tasks, groups, best, seed)
+    Console().print(result_table(record))
+    if config.out is not None:
+        config.out.mkdir(parents=True, exist_ok=True)
+        write_whole(config.out / runs.EVALUATION, runs.to_json(record))
+        write_pictures(record, config.out)
+
+
+if __name__ == "__main__":
+    from ctmrl.console import run_command
+
+    sys.exit(run_command(lambda: main(tyro.cli(EvaluateConfig))))

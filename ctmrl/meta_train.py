@@ -1,0 +1,156 @@
+"""The meta-training loop and all of its state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor, nn
+
+from ctmrl.actor_critic import ActorCritic
+from ctmrl.agent import Agent, build_method, part
+from ctmrl.config import MetaTrainConfig, RunConfig
+from ctmrl.data import OfflineData
+from ctmrl.methods.base import Dimensions
+
+LAST_RATE = 0.01
+"""Share of the learning rates left at the end of a decaying run."""
+
+
+class Learner:
+    """Method, actor-critic, optimisers and generator of one run, and one gradient step of them.
+
+    Attributes:
+        step: gradient steps taken.
+        method: the context-learning method.
+        actor_critic: the actor-critic.
+        optimizers: every optimiser by name; each parameter is in exactly one.
+    """
+
+    def __init__(self, config: RunConfig, data: OfflineData) -> None:
+        """Build everything from the run's seed.
+
+        Raises:
+            UsageError: settings that do not fit the dataset, one sentence.
+        """
+        self.config: MetaTrainConfig = config.training
+        self.data = data
+        self.step = 0
+        statistics = data.statistics(config.context.next_obs_in_context)
+        dims = Dimensions(data.obs_dim, data.act_dim, len(data), config.training.steps)
+        with torch.random.fork_rng():
+            torch.manual_seed(config.seed)
+            self.method = build_method(config, statistics, dims)
+            self.actor_critic = ActorCritic(
+                config.actor_critic, statistics, data.act_dim, config.context.z_dim
+            )
+        self.generator = torch.Generator().manual_seed(config.seed)
+        encoder = torch.optim.Adam(
+            self.method.parameters(), lr=config.context.encoder_lr, fused=True
+        )
+        self.optimizers = {"encoder": encoder, **self.actor_critic.optimizers}
+        self._rates = {name: opt.param_groups[0]["lr"] for name, opt in self.optimizers.items()}
+        self._every = torch.arange(len(data))
+
+    @property
+    def agent(self) -> Agent:
+        """The agent as it is now."""
+        return Agent(self.method, self.actor_critic.actor)
+
+    def all_contexts(self) -> Tensor:
+        """One fresh context of every training task, [T, Z], without gradients."""
+        with torch.no_grad():
+            z: Tensor = self.method.encoder(self._draw(self._every, 1))[0]
+            return z
+
+    def _draw(self, tasks: Tensor, sets: int) -> Tensor:
+        config = self.config
+        return self.data.contexts(
+            tasks, sets, config.context_episodes, config.context_size, self.generator
+        )
+
+    def update(self) -> dict[str, Tensor]:
+        """One gradient step; scalars by metric name."""
+        config, method = self.config, self.method
+        self._set_rates()
+        method.before_step(self.step, self.all_contexts)
+        order = torch.randperm(len(self.data), generator=self.generator)
+        tasks = order[: config.meta_batch]
+        contexts = self._draw(tasks, method.context_sets)
+        batch = self.data.transitions(tasks, config.batch_size, self.generator)
+        z = method.encoder(contexts)
+        loss, metrics = method.context_loss(contexts, z, self.generator)
+        self.optimizers["encoder"].zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizers["encoder"].step()
+        # The first set's contexts; the actor-critic must not send gradients to the encoder.
+        z = z[0].detach()
+        metrics["contexts/between"] = z.std(dim=0).mean()
+        repeated = z.repeat_interleave(config.batch_size, dim=0)
+        metrics |= self.actor_critic.update(batch, repeated, self.generator)
+        self.step += 1
+        return metrics
+
+    def _set_rates(self) -> None:
+        left = 1.0 - self.step / self.config.steps
+        factor = LAST_RATE + (1 - LAST_RATE) * left if self.config.decay else 1.0
+        for name, optimizer in self.optimizers.items():
+            optimizer.param_groups[0]["lr"] = self._rates[name] * factor
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"method": self.method, "actor_critic": self.actor_critic}
+
+    def state(self) -> dict[str, Tensor]:
+        """All there is to continue from, as tensors by name."""
+        found = {"step": torch.tensor(self.step), "generator": self.generator.get_state()}
+        for name, module in self._modules().items():
+            for key, value in module.state_dict().items():
+                found[f"{name}/{key}"] = value
+        for name, optimizer in self.optimizers.items():
+            for index, entry in optimizer.state_dict()["state"].items():
+                for key, value in entry.items():
+                    found[f"optimizer/{name}/{index}/{key}"] = value
+        if self.actor_critic.multiplier is not None:
+            found["multiplier"] = self.actor_critic.multiplier.value
+        return found
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Continue from what `state` gave."""
+        self.step = int(state["step"])
+        self.generator.set_state(state["generator"])
+        for name, module in self._modules().items():
+            module.load_state_dict(part(state, f"{name}/"))
+        for name, optimizer in self.optimizers.items():
+            entries: dict[int, dict[str, Tensor]] = {}
+            for key, value in part(state, f"optimizer/{name}/").items():
+                index, _, what = key.partition("/")
+                entries.setdefault(int(index), {})[what] = value
+            groups = optimizer.state_dict()["param_groups"]
+            optimizer.load_state_dict({"state": entries, "param_groups": groups})
+        if self.actor_critic.multiplier is not None:
+            self.actor_critic.multiplier.value = state["multiplier"]
+
+
+def meta_train(
+    learner: Learner, log_every: int, save: Callable[[], None], save_every: int
+) -> Iterator[dict[str, float]]:
+    """Train to the end, yielding the mean metrics of every `log_every` steps.
+
+    Args:
+        learner: where to begin; its step may be above 0.
+        log_every: steps between two yields; metrics are means over them.
+        save: called every `save_every` steps, after the yield that ends there, and at the end.
+        save_every: a multiple of `log_every`.
+    """
+    steps = learner.config.steps
+    sums: dict[str, Tensor] = {}
+    since = 0
+    while learner.step < steps:
+        for key, value in learner.update().items():
+            sums[key] = sums[key] + value if key in sums else value
+        since += 1
+        if learner.step % log_every == 0 or learner.step == steps:
+            yield {"step": learner.step} | {k: float(v) / since for k, v in sums.items()}
+            sums, since = {}, 0
+            if learner.step % save_every == 0 or learner.step == steps:
+                save()

@@ -1,0 +1,23 @@
+"""The methods: one row each."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ctmrl.methods.base import Method, MethodConfig
+from ctmrl.methods.ctmrl import CTMRL, CTMRLConfig
+from ctmrl.methods.focal import FOCAL, FOCALConfig
+
+
+class Row(NamedTuple):
+    """A method: its class, its config's class, and what it is in a few words."""
+
+    method: type[Method]
+    config: type[MethodConfig]
+    summary: str
+
+
+METHODS: dict[str, Row] = {
+    "ctmrl": Row(CTMRL, CTMRLConfig, "codebook of cross-task contexts (the source paper)"),
+    "focal": Row(FOCAL, FOCALConfig, "distance metric between contexts (Li et al. 2021)"),
+}

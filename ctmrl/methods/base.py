@@ -1,0 +1,89 @@
+"""What a method is: how contexts are made from transitions, and what trains that."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ctmrl.networks import ContextEncoder, Statistics
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """Hyper-parameters of the context that every method has; a method's own config adds to it."""
+
+    z_dim: int = 20
+    """Size of a context."""
+    encoder_hidden: tuple[int, ...] = (128, 128)
+    """Widths of the encoder's hidden layers."""
+    encoder_lr: float = 1e-3
+    """Learning rate of the encoder and all that is trained with it, at the start."""
+    next_obs_in_context: bool = True
+    """Whether the encoder sees s' beside s, a and r."""
+
+
+class Dimensions(NamedTuple):
+    """Sizes a method builds its networks from.
+
+    Attributes:
+        obs: O.
+        act: A.
+        tasks: number of training tasks.
+        steps: gradient steps of the whole run.
+    """
+
+    obs: int
+    act: int
+    tasks: int
+    steps: int
+
+
+class Method(nn.Module, ABC):
+    """A context-learning method. Everything else - data, actor-critic, meta-test - is shared.
+
+    Subclasses own their networks; all their parameters are trained by one optimiser with
+    `config.encoder_lr`, on the loss that `context_loss` returns.
+    """
+
+    context_sets = 1
+    """Contexts from different episodes each step needs of a task."""
+
+    def __init__(self, config: MethodConfig, statistics: Statistics, dims: Dimensions) -> None:
+        """Build the encoder; initial weights come from torch's global generator."""
+        super().__init__()
+        self.dims = dims
+        self.encoder = ContextEncoder(
+            statistics.context, dims.obs, config.encoder_hidden, config.z_dim
+        )
+
+    @abstractmethod
+    def context_loss(
+        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss that trains the encoder.
+
+        Args:
+            contexts: [context_sets, B, n, O + A + 1 + O], transitions (s, a, r, s').
+            z: their task-specific contexts [context_sets, B, Z], with gradients.
+            generator: of all draws.
+
+        Returns:
+            Scalar loss, and scalars by metric name (the same names every step).
+        """
+
+    def before_step(self, step: int, all_contexts: Callable[[], Tensor]) -> None:
+        """Do what a schedule asks for before gradient step `step`, 0..dims.steps-1.
+
+        Args:
+            step: the step about to be taken.
+            all_contexts: draws one fresh task-specific context of every training task, [T, Z].
+        """
+
+    def code_of(self, z: Tensor) -> Tensor | None:
+        """Code of each context [*, Z], int64 [*]; None where a method has no codes."""
+        return None

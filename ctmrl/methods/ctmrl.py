@@ -1,0 +1,193 @@
+"""CTMRL: contexts shaped by a codebook of cross-task contexts, the CQ-VAE of the source paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ctmrl import cqvae
+from ctmrl.codebook import Codebook, perplexity
+from ctmrl.errors import UsageError
+from ctmrl.methods.base import Dimensions, Method, MethodConfig
+from ctmrl.metric import focal_metric_loss
+from ctmrl.networks import Predictors, Statistics
+
+
+@dataclass(frozen=True)
+class CTMRLConfig(MethodConfig):
+    """Hyper-parameters of CTMRL; the four switches are the ablations of the paper's Table 2."""
+
+    codes: int = 8
+    """N, codes in the codebook; fewer than training tasks."""
+    code_contrast: bool = True
+    """Use L_C, equation (3)."""
+    cross_prediction: bool = True
+    """Use L_pre^cro, equations (7) to (9)."""
+    kmeans: bool = True
+    """Place and refresh the codes by K-means; off: random unit vectors, no refresh."""
+    contrast: bool = True
+    """Use L_contra, equation (10)."""
+    tau: float = 0.1
+    """Temperature of equations (3) and (10)."""
+    eta: float = 0.1
+    """Learning rate of the codes, equation (2)."""
+    extra_negatives: int = 8
+    """M, negatives of a task that is alone with its code."""
+    warm_up: float = 0.3
+    """Share of the steps before the codebook is used; contexts are collected in its last third."""
+    refresh: float = 0.05
+    """Share of the steps between two K-means refreshes."""
+    code_contrast_weight: float = 1.0
+    """Weight of L_C, averaged over tasks."""
+    cross_prediction_weight: float = 1.0
+    """Weight of L_pre^cro, averaged over tasks and transitions."""
+    contrast_weight: float = 1.0
+    """Weight of L_contra."""
+    metric_weight: float = 0.0
+    """Weight of FOCAL's metric loss, which the released code adds (10) and the paper lacks."""
+    predictor_hidden: tuple[int, ...] = (128, 128)
+    """Widths of the predictors' hidden layers."""
+
+
+COLLECTIONS = 10
+"""Times the contexts of all training tasks are collected for one run of K-means."""
+
+
+class CTMRL(Method):
+    """CTMRL: encoder, codebook, and reward and state predictors, trained end to end."""
+
+    context_sets = 2
+
+    def __init__(self, config: CTMRLConfig, statistics: Statistics, dims: Dimensions) -> None:
+        """Build the CQ-VAE.
+
+        Raises:
+            UsageError: not fewer codes than training tasks, or none.
+        """
+        super().__init__(config, statistics, dims)
+        if not 1 <= config.codes < dims.tasks:
+            raise UsageError(
+                f"--codes must be at least 1 and less than the {dims.tasks} training tasks, "
+                f"got {config.codes}"
+            )
+        self.config = config
+        self.predictors = Predictors(statistics, dims.act, config.z_dim, config.predictor_hidden)
+        start = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
+        self.codebook = Codebook(config.codes, config.z_dim, start)
+        self.collected: Tensor
+        empty = torch.zeros(COLLECTIONS, dims.tasks, config.z_dim)
+        self.register_buffer("collected", empty)
+        self._schedule = Schedule(config, dims.steps)
+
+    def before_step(self, step: int, all_contexts: Callable[[], Tensor]) -> None:
+        """Collect contexts, place the codebook after the warm-up, refresh it at its interval."""
+        if not self.config.kmeans:
+            if step == self._schedule.start:
+                self.codebook.placed.fill_(True)
+            return
+        for slot in self._schedule.slots(step):
+            self.collected[slot] = all_contexts()
+        if self._schedule.ends_interval(step):
+            contexts = self.collected.flatten(0, 1)
+            if self.codebook.placed:
+                self.codebook.refresh(contexts, self.config.eta, seed=step)
+            else:
+                self.codebook.place(contexts, seed=step)
+
+    def context_loss(
+        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Equations (3) to (10); the codebook's terms are 0 until the warm-up is over."""
+        config, zero = self.config, torch.zeros(())
+        anchors, positives = z
+        tasks, n = contexts.shape[1:3]
+        losses = {"spe_prediction": zero, "metric": zero}
+        losses |= {"code_contrast": zero, "cro_prediction": zero, "contrast": zero}
+        matched = self.codebook.match(anchors)
+        if self.codebook.placed:
+            self.codebook.update(anchors.detach(), matched, config.eta)
+            codes = self.codebook.codes
+            if config.contrast:
+                negatives = cqvae.hard_negatives(matched, config.extra_negatives, generator)
+                losses["contrast"] = cqvae.hard_contrast_loss(
+                    anchors, positives, matched, negatives, config.tau, len(codes)
+                )
+            if config.code_contrast:
+                losses["code_contrast"] = (
+                    cqvae.code_contrast_loss(anchors, codes, config.tau) / tasks
+                )
+        spe, cro = self._prediction(contexts[0], anchors, matched)
+        losses["spe_prediction"] = spe / n
+        losses["cro_prediction"] = cro / n
+        if config.metric_weight:
+            losses["metric"] = focal_metric_loss(anchors)
+        total = (
+            losses["spe_prediction"]
+            + config.cross_prediction_weight * losses["cro_prediction"]
+            + config.code_contrast_weight * losses["code_contrast"]
+            + config.contrast_weight * losses["contrast"]
+            + config.metric_weight * losses["metric"]
+        )
+        metrics = {f"loss/encoder/{name}": value.detach() for name, value in losses.items()}
+        metrics["codes/perplexity"] = perplexity(matched, config.codes)
+        return total, metrics
+
+    def _prediction(self, context: Tensor, z: Tensor, matched: Tensor) -> tuple[Tensor, Tensor]:
+        """L_pre^spe and L_pre^cro, equations (6) and (9), each a mean over tasks."""
+        o, a = self.dims.obs, self.dims.act
+        obs, action, reward, next_obs = torch.split(context, [o, a, 1, o], dim=-1)
+        targets = self.predictors.targets(reward, obs, next_obs)
+        used = [z]
+        if self.codebook.placed and self.config.cross_prediction:
+            # The value is the code's; the gradient reaches both the code and the context, whose
+            # matching to the code has none of its own.
+            used.append(self.codebook.codes[matched] + z - z.detach())
+        n = context.shape[1]
+        conditions = torch.stack(used)[:, :, None].expand(-1, -1, n, -1)
+        many = len(used)
+        predicted = self.predictors(
+            obs.expand(many, *obs.shape), action.expand(many, *action.shape), conditions
+        )
+        per_task = cqvae.prediction_loss(
+            cqvae.reward_prediction_loss(predicted[0], targets[0]),
+            cqvae.state_prediction_loss(predicted[1], targets[1]),
+        )
+        means = per_task.mean(dim=1)
+        return means[0], means[1] if many == 2 else torch.zeros(())
+
+    def code_of(self, z: Tensor) -> Tensor:
+        """Equation (1)."""
+        return self.codebook.match(z)
+
+
+class Schedule:
+    """Which steps collect contexts and which run K-means."""
+
+    def __init__(self, config: CTMRLConfig, steps: int) -> None:
+        """Turn shares of the run into steps."""
+        self.start = max(round(config.warm_up * steps), 1)
+        self.period = max(round(config.refresh * steps), 1)
+        self.first = max(round(config.warm_up * steps / 3), 1)
+
+    def _interval(self, step: int) -> tuple[int, int]:
+        """First step and length of the collecting interval that ends at or after `step`."""
+        if step <= self.start:
+            return self.start - self.first, self.first
+        passed = (step - self.start - 1) // self.period
+        return self.start + passed * self.period, self.period
+
+    def ends_interval(self, step: int) -> bool:
+        """Whether K-means runs before this step."""
+        begin, length = self._interval(step)
+        return step == begin + length
+
+    def slots(self, step: int) -> range:
+        """Slots of the collection to fill before this step, none for most steps."""
+        begin, length = self._interval(step)
+        if step <= begin:
+            return range(0)
+        before, now = (((step - begin - k) * COLLECTIONS) // length for k in (1, 0))
+        return range(before, now)

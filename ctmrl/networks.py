@@ -1,0 +1,197 @@
+"""The networks of every method: plain multi-layer perceptrons with ReLU."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+LOG_STD_RANGE = (-20.0, 0.0)
+"""Bounds of the policy's log standard deviation, as in the field's code since FOCAL."""
+
+
+def mlp(in_dim: int, hidden: tuple[int, ...], out_dim: int) -> nn.Sequential:
+    """ReLU network [*, in_dim] -> [*, out_dim]."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(in_dim, width), nn.ReLU()]
+        in_dim = width
+    return nn.Sequential(*layers, nn.Linear(in_dim, out_dim))
+
+
+class Standardize(nn.Module):
+    """(x - mean) / std with fixed statistics of the training data; constant columns pass as 0."""
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, mean: Tensor, std: Tensor) -> None:
+        """Keep the statistics, each [D], as buffers, so that a checkpoint carries them."""
+        super().__init__()
+        self.register_buffer("mean", mean.clone())
+        self.register_buffer("scale", torch.where(std > 1e-6, 1.0 / std.clamp_min(1e-6), 0.0))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Standardised x, [*, D]."""
+        return (x - self.mean) * self.scale
+
+
+class Statistics(NamedTuple):
+    """Mean and standard deviation of the training tasks' data.
+
+    Attributes:
+        obs: two tensors [O].
+        context: two tensors [O + A + 1 (+ O)], of (s, a, r) and, where contexts have it, s' - s.
+        target: two tensors [1 + O], of (r, s' - s), what the predictors predict.
+    """
+
+    obs: tuple[Tensor, Tensor]
+    context: tuple[Tensor, Tensor]
+    target: tuple[Tensor, Tensor]
+
+
+class ContextEncoder(nn.Module):
+    """e(h): context transitions -> encodings in (-1, 1); a context is their mean."""
+
+    def __init__(
+        self, statistics: tuple[Tensor, Tensor], obs_dim: int, hidden: tuple[int, ...], z_dim: int
+    ) -> None:
+        """Build the network; whether it sees s' follows from the statistics' size."""
+        super().__init__()
+        self.obs_dim = obs_dim
+        self.standardize = Standardize(*statistics)
+        self.in_dim = len(statistics[0])
+        self.net = mlp(self.in_dim, hidden, z_dim)
+        self.z_dim = z_dim
+
+    def encode(self, context: Tensor) -> Tensor:
+        """Encodings [*, n, Z] of context transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""
+        features = context[..., : self.in_dim]
+        if self.in_dim == context.shape[-1]:
+            # s' - s instead of s': what the dynamics did, on a scale of its own.
+            change = context[..., -self.obs_dim :] - context[..., : self.obs_dim]
+            features = torch.cat([context[..., : -self.obs_dim], change], dim=-1)
+        encoded: Tensor = torch.tanh(self.net(self.standardize(features)))
+        return encoded
+
+    def forward(self, context: Tensor) -> Tensor:
+        """Task-specific contexts c^spe = mean_t e(h^t): [*, n, F] -> [*, Z]."""
+        return self.encode(context).mean(dim=-2)
+
+
+class ActionSample(NamedTuple):
+    """A reparameterised action with what its loss needs; A is the action's size.
+
+    Attributes:
+        action: tanh(mean + std * noise), [*, A].
+        log_prob: log density of the action, [*].
+        mean: before the tanh, [*, A].
+        log_std: clamped, [*, A].
+    """
+
+    action: Tensor
+    log_prob: Tensor
+    mean: Tensor
+    log_std: Tensor
+
+
+class Actor(nn.Module):
+    """Tanh-Gaussian policy pi(a | s, z)."""
+
+    def __init__(
+        self,
+        statistics: tuple[Tensor, Tensor],
+        z_dim: int,
+        hidden: tuple[int, ...],
+        act_dim: int,
+    ) -> None:
+        """Build the network; `statistics` are of the observations."""
+        super().__init__()
+        self.standardize = Standardize(*statistics)
+        self.net = mlp(len(statistics[0]) + z_dim, hidden, 2 * act_dim)
+
+    def forward(self, obs: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean before the tanh and clamped log standard deviation, each [*, A]."""
+        out = self.net(torch.cat([self.standardize(obs), z], dim=-1))
+        mean, log_std = out.chunk(2, dim=-1)
+        return mean, log_std.clamp(*LOG_STD_RANGE)
+
+    def sample(self, obs: Tensor, z: Tensor, generator: torch.Generator) -> ActionSample:
+        """Draw actions [*, A] for observations [*, O] and contexts [*, Z]."""
+        mean, log_std = self(obs, z)
+        noise = torch.randn(mean.shape, generator=generator)
+        pre_tanh = mean + log_std.exp() * noise
+        action = torch.tanh(pre_tanh)
+        gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        log_prob = (gaussian - torch.log(1 - action.square() + 1e-6)).sum(dim=-1)
+        return ActionSample(action, log_prob, mean, log_std)
+
+    @torch.no_grad()
+    def act(self, obs: Tensor, z: Tensor) -> Tensor:
+        """Deterministic actions tanh(mean), [*, A]."""
+        return torch.tanh(self(obs, z)[0])
+
+
+class Critic(nn.Module):
+    """One or two scalar functions of (s, z) or (s, a, z), evaluated as one batched network."""
+
+    def __init__(
+        self,
+        statistics: tuple[Tensor, Tensor],
+        extra_dim: int,
+        hidden: tuple[int, ...],
+        heads: int,
+    ) -> None:
+        """Build `heads` independent networks; `extra_dim` is the size of what stands beside s."""
+        super().__init__()
+        self.standardize = Standardize(*statistics)
+        sizes = (len(statistics[0]) + extra_dim, *hidden, 1)
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for fan_in, fan_out in pairwise(sizes):
+            layers = [nn.Linear(fan_in, fan_out) for _ in range(heads)]
+            self.weights.append(torch.stack([layer.weight.detach().T for layer in layers]))
+            self.biases.append(torch.stack([layer.bias.detach()[None] for layer in layers]))
+
+    def forward(self, obs: Tensor, *others: Tensor) -> Tensor:
+        """Values [heads, n] of observations [n, O] and what stands beside them, each [n, D]."""
+        x = torch.cat([self.standardize(obs), *others], dim=-1)
+        h = x.expand(len(self.weights[0]), *x.shape)
+        last = len(self.weights) - 1
+        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            h = torch.baddbmm(bias, h, weight)
+            if index < last:
+                h = torch.relu(h)
+        return h[..., 0]
+
+
+class Predictors(nn.Module):
+    """Context-based reward and state predictors, r(s, a, c) and s'(s, a, c)."""
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        act_dim: int,
+        z_dim: int,
+        hidden: tuple[int, ...],
+    ) -> None:
+        """Build both networks; they predict in units of the targets' standard deviations."""
+        super().__init__()
+        obs_dim = len(statistics.obs[0])
+        self.standardize = Standardize(*statistics.obs)
+        self.standardize_target = Standardize(*statistics.target)
+        self.reward_net = mlp(obs_dim + act_dim + z_dim, hidden, 1)
+        self.state_net = mlp(obs_dim + act_dim + z_dim, hidden, obs_dim)
+
+    def forward(self, obs: Tensor, action: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Standardised rewards [*, 1] and state changes [*, O]."""
+        x = torch.cat([self.standardize(obs), action, z], dim=-1)
+        return self.reward_net(x), self.state_net(x)
+
+    def targets(self, reward: Tensor, obs: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        """What `forward` should give: rewards [*, 1] and observations [*, O] to both."""
+        both = self.standardize_target(torch.cat([reward, next_obs - obs], dim=-1))
+        return both[..., :1], both[..., 1:]

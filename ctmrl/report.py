@@ -1,0 +1,179 @@
+"""An evaluation's record as a table and as pictures; needs neither torch nor an environment."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from ctmrl.files import write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LABELS = {
+    "oracle": "oracle (exact optimum)",
+    "best_behavior": "best behaviour policy",
+    "wind_blind": "wind-blind controller",
+    "random": "random",
+}
+TITLES = {
+    "unseen": "unseen tasks",
+    "seen": "seen tasks",
+    "fresh": "fresh tasks",
+}
+COLORS = {"unseen": "#c1440e", "seen": "#1f6f8b", "fresh": "#6a4c93"}
+
+
+def ordered_groups(record: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The record's groups of tasks in the order they are shown in."""
+    return {name: record["groups"][name] for name in TITLES if name in record["groups"]}
+
+
+def score(value: float, references: dict[str, float]) -> float | None:
+    """Normalised score of a mean return: 0 is random, 100 the optimum or the best policy known."""
+    expert = references.get("oracle", references.get("best_behavior"))
+    if expert is None:
+        return None
+    return 100.0 * (value - references["random"]) / (expert - references["random"])
+
+
+def result_table(record: dict[str, Any]) -> Table:
+    """Returns and normalised scores of the method beside the references of the same tasks."""
+    groups = ordered_groups(record)
+    table = Table(title=f"{record['env']}, {record['method']}, seed {record['seed']}")
+    table.add_column("")
+    for name, group in groups.items():
+        count = len(group["tasks"])
+        table.add_column(f"{TITLES[name]} ({count})\nreturn", justify="right")
+        table.add_column("\nscore", justify="right")
+    rows = {f"{record['method']} (last checkpoint)": [g["return"] for g in groups.values()]}
+    for key, label in LABELS.items():
+        values = [group["references"].get(key) for group in groups.values()]
+        if any(value is not None for value in values):
+            rows[label] = values
+    for index, (label, values) in enumerate(rows.items()):
+        cells: list[str] = []
+        for value, group in zip(values, groups.values(), strict=True):
+            normal = None if value is None else score(value, group["references"])
+            cells += ["-" if value is None else f"{value:.2f}"]
+            cells += ["-" if normal is None else f"{normal:.1f}"]
+        table.add_row(label, *cells, style="bold" if index == 0 else "")
+    return table
+
+
+def write_pictures(record: dict[str, Any], folder: Path) -> None:
+    """Write adaptation.png and contexts.png into a folder."""
+    for name, draw in (("adaptation.png", adaptation_figure), ("contexts.png", context_figure)):
+        buffer = BytesIO()
+        # Without a version in it, so that equal results give equal bytes.
+        draw(record).savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+        write_whole(folder / name, buffer.getvalue())
+
+
+def adaptation_figure(record: dict[str, Any]) -> Figure:
+    """Return against episodes of adaptation, with the references as lines."""
+    from matplotlib.figure import Figure
+
+    groups = ordered_groups(record)
+    figure = Figure(figsize=(5.4 * len(groups), 4.2), layout="constrained")
+    all_axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
+    for axes, (name, group) in zip(all_axes, groups.items(), strict=True):
+        _draw_curve(axes, name, group, record)
+    all_axes[0].set_ylabel("return of a fresh episode")
+    figure.suptitle(f"{record['env']}: adapting with {record['method']}, seed {record['seed']}")
+    return figure
+
+
+def _draw_curve(axes: Axes, name: str, group: dict[str, Any], record: dict[str, Any]) -> None:
+    curve = np.array(group["curve"])
+    episodes = np.arange(len(curve))
+    mean = curve.mean(axis=1)
+    low, high = np.percentile(curve, [10, 90], axis=1)
+    color = COLORS[name]
+    axes.fill_between(episodes, low, high, color=color, alpha=0.18, lw=0)
+    axes.plot(
+        episodes, mean, color=color, lw=2, label=f"{record['method']} (mean, 10-90% of tasks)"
+    )
+    styles = {"oracle": "-", "best_behavior": "-.", "wind_blind": "--"}
+    for key, style in styles.items():
+        if key in group["references"]:
+            value = group["references"][key]
+            axes.axhline(value, color="0.35", ls=style, lw=1, label=f"{LABELS[key]} {value:.2f}")
+    change = record["protocol"]["random_episodes"]
+    if change < len(curve) - 1:
+        axes.axvline(change, color="0.8", lw=1, zorder=0)
+    near = [value for key, value in group["references"].items() if key != "random"]
+    # The first points, on an empty context, may lie far below: cut them off rather than the rest.
+    top, bottom = max([*near, mean.max()]), min([*near, mean[1:].min(), np.median(low)])
+    axes.set_ylim(bottom - 0.35 * (top - bottom), top + 0.1 * (top - bottom))
+    axes.set_xlabel(f"adaptation episodes ({change} random, then with the policy)")
+    axes.set_title(f"{TITLES[name]}: {group['return']:.2f}")
+    axes.legend(fontsize=8, loc="lower right", framealpha=0.9)
+
+
+def context_figure(record: dict[str, Any]) -> Figure:
+    """Contexts in the plane of their two main directions, coloured by task and by code."""
+    from matplotlib.figure import Figure
+
+    groups = ordered_groups(record)
+    contexts = np.concatenate([np.array(group["contexts"]) for group in groups.values()])
+    params = np.concatenate([np.array(group["params"]) for group in groups.values()])
+    points, share = plane(contexts)
+    starts = np.cumsum([0, *(len(group["tasks"]) for group in groups.values())])
+    parts = [slice(a, b) for a, b in pairwise(starts)]
+    has_codes = all(group["codes"] is not None for group in groups.values())
+    figure = Figure(figsize=(11 if has_codes else 5.6, 4.8), layout="constrained")
+    all_axes = figure.subplots(1, 2 if has_codes else 1, squeeze=False)[0]
+    angle = (
+        np.degrees(np.arctan2(params[:, 1], params[:, 0])) if params.shape[1] > 1 else params[:, 0]
+    )
+    panels = [(angle, "twilight" if np.ptp(angle) > 200 else "viridis", _parameter(record))]
+    if has_codes:
+        codes = np.concatenate([np.array(group["codes"]) for group in groups.values()])
+        panels.append((codes, "tab20", f"code ({len(np.unique(codes))} in use)"))
+    for axes, (values, colors, label) in zip(all_axes, panels, strict=True):
+        for name, part in zip(groups, parts, strict=True):
+            drawn = axes.scatter(
+                points[part, 0],
+                points[part, 1],
+                c=values[part],
+                cmap=colors,
+                vmin=values.min(),
+                vmax=max(values.max(), values.min() + 1),
+                marker="o" if name == "seen" else "*",
+                s=45 if name == "seen" else 150,
+                edgecolors="0.2",
+                linewidths=0.6,
+                label=TITLES[name],
+            )
+        axes.set_xlabel(f"first direction ({share[0]:.0%} of the variance)")
+        axes.set_ylabel(f"second direction ({share[1]:.0%})")
+        axes.set_title(f"coloured by {label}")
+        axes.legend(fontsize=8)
+        if colors != "tab20":
+            figure.colorbar(drawn, ax=axes, label=label)
+    figure.suptitle(f"{record['env']}: contexts after adaptation, {record['method']}")
+    return figure
+
+
+def _parameter(record: dict[str, Any]) -> str:
+    names = record["param_names"]
+    return f"angle of ({', '.join(names)}), degrees" if len(names) > 1 else str(names[0])
+
+
+def plane(contexts: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Principal components: contexts [n, Z] -> points [n, 2] and their shares of the variance."""
+    centred = contexts - contexts.mean(axis=0)
+    _, sizes, directions = np.linalg.svd(centred, full_matrices=False)
+    # A direction's sign is arbitrary: let its largest entry be positive.
+    largest = np.abs(directions).argmax(axis=1)
+    directions = directions * np.sign(directions[np.arange(len(directions)), largest])[:, None]
+    share = sizes**2 / max(float((sizes**2).sum()), 1e-12)
+    return centred @ directions[:2].T, share[:2]

@@ -1,0 +1,178 @@
+"""A run's folder: what it holds, and how a run that was interrupted goes on in it."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import io
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ctmrl.errors import UsageError
+from ctmrl.files import write_whole
+
+CONFIG, METRICS, CHECKPOINT, EVALUATION = (
+    "config.json",
+    "metrics.csv",
+    "checkpoint.pt",
+    "evaluation.json",
+)
+
+
+class RunError(UsageError):
+    """A run folder that cannot be used: which, why, and what to do."""
+
+
+def to_json(content: object) -> bytes:
+    """Readable JSON with a fixed order of keys; NaN is refused."""
+    return (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file of a run.
+
+    Raises:
+        RunError: it is missing or not JSON.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise RunError(
+            f"{path.parent} is not a run's folder: it has no {path.name}; "
+            "python -m ctmrl.train makes one"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path} cannot be read ({error}): train again with --restart") from None
+    if not isinstance(content, dict):
+        raise RunError(f"{path} is not of a run: train again with --restart")
+    return content
+
+
+def load_checkpoint(path: Path) -> dict[str, Tensor]:
+    """Read a checkpoint: tensors by name, nothing else.
+
+    Raises:
+        RunError: it is missing or damaged.
+    """
+    try:
+        state = torch.load(path, weights_only=True)
+    except FileNotFoundError:
+        raise RunError(f"{path.parent} has no {path.name} yet: train it first") from None
+    except Exception as error:  # torch raises many kinds for damaged files
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RunError(f"{path} is damaged ({reason}): train again with --restart") from None
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise RunError(f"{path} is not a checkpoint of a run: train again with --restart")
+    return state
+
+
+class RunFolder:
+    """The folder of one run, locked for as long as this object lives.
+
+    Attributes:
+        path: the folder.
+    """
+
+    def __init__(self, path: Path, settings: dict[str, Any], restart: bool) -> None:
+        """Make the folder, or find it as an earlier process left it.
+
+        Args:
+            path: the folder.
+            settings: all that decides the run's results; goes into config.json.
+            restart: throw away what is there.
+
+        Raises:
+            RunError: the folder holds a run with other settings, something that is not a run, or
+                a run at work.
+        """
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(path, os.O_RDONLY)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(f"another process is at work in {path}: wait for it") from None
+        except OSError as error:
+            raise RunError(f"{path} cannot be written to ({error.strerror}): try --out") from None
+        config = path / CONFIG
+        if restart and config.exists():
+            for entry in path.iterdir():
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        if config.exists():
+            self._compare(read_json(config), settings)
+        elif any(entry for entry in path.iterdir() if not entry.name.endswith(".partial")):
+            raise RunError(f"{path} holds files that are not of a run: choose another --out")
+        else:
+            write_whole(config, to_json(settings))
+
+    def close(self) -> None:
+        """Let others use the folder."""
+        os.close(self._lock)
+
+    def _compare(self, there: dict[str, Any], asked: dict[str, Any]) -> None:
+        # Through JSON, because a tuple comes back as a list.
+        flat, wanted = flatten(there), flatten(json.loads(to_json(asked)))
+        for key in sorted(flat.keys() | wanted.keys()):
+            if flat.get(key) != wanted.get(key):
+                raise RunError(
+                    f"{self.path} holds a run with {key} = {flat.get(key)}, this one has "
+                    f"{wanted.get(key)}: choose another --out, or --restart to throw it away"
+                )
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has been evaluated."""
+        return (self.path / EVALUATION).exists()
+
+    def checkpoint(self) -> dict[str, Tensor] | None:
+        """The last checkpoint, None before the first."""
+        path = self.path / CHECKPOINT
+        return load_checkpoint(path) if path.exists() else None
+
+    def save_checkpoint(self, state: dict[str, Tensor]) -> None:
+        """Replace the checkpoint."""
+        # Fresh strings and storages: a pickle's bytes depend on which objects are the same.
+        fresh = {f"{key}": value.detach().clone() for key, value in sorted(state.items())}
+        buffer = io.BytesIO()
+        torch.save(fresh, buffer)
+        write_whole(self.path / CHECKPOINT, buffer.getvalue())
+
+    def rewind_metrics(self, step: int) -> None:
+        """Forget the metrics of steps after `step`, which will be taken again."""
+        path = self.path / METRICS
+        if not path.exists():
+            return
+        lines = path.read_text().split("\n")[:-1]
+        kept = [line for line in lines[1:] if int(line.partition(",")[0]) <= step]
+        write_whole(path, "".join(f"{line}\n" for line in [*lines[:1], *kept]).encode())
+
+    def append_metrics(self, row: dict[str, float | None]) -> None:
+        """Add a row; the first one's keys are the columns."""
+        path = self.path / METRICS
+        new = not path.exists() or not path.stat().st_size
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, list(row), lineterminator="\n")
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+
+    def write_json(self, name: str, content: object) -> None:
+        """Write a JSON file of the run."""
+        write_whole(self.path / name, to_json(content))
+
+
+def flatten(nested: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dictionaries as one, with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in nested.items():
+        if isinstance(value, dict):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat

@@ -1,0 +1,284 @@
+"""`python -m ctmrl.train`: meta-train a method on an offline dataset and meta-test it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.console import Console
+
+    from ctmrl.config import RunConfig
+    from ctmrl.meta_train import Learner
+    from ctmrl.runs import RunFolder
+    from datagen.dataset import Dataset
+
+LOGS, CHECKPOINTS, RETURNS = 100, 50, 10
+"""Rows of metrics, checkpoints, and measured returns on training tasks in a run."""
+NOT_SETTINGS = {"data", "out", "restart", "tensorboard"}
+"""Fields of RunConfig that do not change a run's results."""
+PACKAGES = ("ctmrl", "numpy", "torch", "gymnasium", "scikit-learn")
+
+
+@dataclass(frozen=True)
+class Split:
+    """Tasks of a run: trained on, and scored as unseen."""
+
+    train: NDArray[np.int64]
+    unseen: NDArray[np.int64]
+
+
+def split_tasks(dataset: Dataset, validate: bool) -> Split:
+    """The dataset's split, or with `validate` one inside its training tasks."""
+    import numpy as np
+
+    from meta_envs import task_set
+
+    if not validate:
+        return Split(dataset.train_tasks, task_set(dataset.env).test_tasks)
+    held_out = dataset.train_tasks[2::5]
+    return Split(np.setdiff1d(dataset.train_tasks, held_out), held_out)
+
+
+def best_behavior(dataset: Dataset) -> dict[int, float]:
+    """Deterministic return of each task's best behaviour policy."""
+    return {
+        int(task): max(dataset.entry(int(task))["returns"]["deterministic"].values())
+        for task in dataset.tasks
+    }
+
+
+def settings_of(
+    config: RunConfig, dataset: Dataset, split: Split, learner: Learner
+) -> dict[str, Any]:
+    """What config.json holds: all that decides the run's results."""
+    return {
+        "settings": {
+            key: value
+            for key, value in dataclasses.asdict(config).items()
+            if key not in NOT_SETTINGS
+        },
+        "dataset": dataset.hash,
+        "groups": {"unseen": split.unseen.tolist(), "seen": split.train.tolist()},
+        "best_behavior": {str(task): value for task, value in best_behavior(dataset).items()},
+        "dimensions": learner.method.dims._asdict(),
+        "versions": {name: metadata.version(name) for name in PACKAGES},
+    }
+
+
+def open_data(config: RunConfig) -> Dataset:
+    """Open the run's dataset.
+
+    Raises:
+        UsageError: it is of another environment or has no training tasks.
+        DatasetError: it is missing or damaged.
+    """
+    from ctmrl.errors import UsageError
+    from datagen.dataset import open_dataset
+
+    path = config.data or Path("datasets") / config.env
+    dataset = open_dataset(path, verify=False)
+    if dataset.env != config.env:
+        raise UsageError(
+            f"{path} is of {dataset.env}, not of {config.env}: "
+            f"give --env {dataset.env} or another --data"
+        )
+    if len(dataset.train_tasks) < 2:
+        raise UsageError(
+            f"{path} has {len(dataset.train_tasks)} training tasks, at least 2 are needed: "
+            f"python -m datagen.collect --env {config.env} collects them"
+        )
+    return dataset
+
+
+def train(config: RunConfig, console: Console) -> dict[str, Any]:
+    """Train, or go on training, then evaluate; everything goes into the run folder.
+
+    Returns:
+        The evaluation's record.
+    """
+    from ctmrl import runs
+    from ctmrl.data import OfflineData
+    from ctmrl.meta_train import Learner
+    from ctmrl.threads import settle_threads
+
+    settle_threads(config.threads)
+    dataset = open_data(config)
+    split = split_tasks(dataset, config.validate)
+    data = OfflineData(dataset, split.train, config.actor_critic.timeouts_as_terminals)
+    learner = Learner(config, data)
+    path = config.out or default_folder(config)
+    settings = settings_of(config, dataset, split, learner)
+    folder = runs.RunFolder(path, settings, config.restart)
+    try:
+        if folder.finished:
+            console.print(f"{path} is finished; --restart trains it anew, --seed n another.")
+            return runs.read_json(path / runs.EVALUATION)
+        _meta_train(config, learner, folder, console)
+        return _evaluate(config, learner, folder, split, best_behavior(dataset))
+    finally:
+        folder.close()
+
+
+def default_folder(config: RunConfig) -> Path:
+    """runs/<env>/<method>/seed-<n>, beside it for runs that must not be mistaken for those."""
+    name = f"{config.method}-validation" if config.validate else config.method
+    return Path("runs") / config.env / name / f"seed-{config.seed}"
+
+
+def _meta_train(config: RunConfig, learner: Learner, folder: RunFolder, console: Console) -> None:
+    from ctmrl.console import TrainingDisplay
+    from ctmrl.errors import UsageError
+    from ctmrl.meta_train import meta_train
+
+    state = folder.checkpoint()
+    if state is not None:
+        learner.load(state)
+        console.print(f"Going on at step {learner.step} of {config.training.steps}.")
+    folder.rewind_metrics(learner.step)
+    steps = config.training.steps
+    log_every = max(steps // LOGS, 1)
+    save_every = log_every * max(LOGS // CHECKPOINTS, 1)
+    measure_every = log_every * max(LOGS // RETURNS, 1)
+    writer = _tensorboard(folder.path, learner.step) if config.tensorboard else None
+    n_codes = getattr(config.context, "codes", None)
+    with TrainingDisplay(console, steps, learner.step, n_codes) as display:
+        for metrics in meta_train(
+            learner, log_every, lambda: folder.save_checkpoint(learner.state()), save_every
+        ):
+            bad = next((key for key, value in metrics.items() if not math.isfinite(value)), None)
+            if bad is not None:
+                raise UsageError(
+                    f"training diverged: {bad} is {metrics[bad]} before step {learner.step}; the "
+                    f"checkpoint in {folder.path} is older; try a lower learning rate"
+                )
+            measure = learner.step % measure_every == 0 or learner.step == steps
+            value = _training_return(config, learner) if measure else None
+            row: dict[str, float | None] = {**metrics, "return/training_tasks": value}
+            folder.append_metrics(row)
+            if writer is not None:
+                for key, number in row.items():
+                    if key != "step" and number is not None:
+                        writer.add_scalar(key, number, learner.step)
+            display.show(row)
+
+
+def _training_return(config: RunConfig, learner: Learner) -> float:
+    from ctmrl.meta_test import meta_test
+    from meta_envs import task_set
+
+    once = dataclasses.replace(config.meta_test, repetitions=1)
+    result = meta_test(
+        learner.method.encoder,
+        learner.actor_critic.actor,
+        task_set(config.env),
+        learner.data.tasks,
+        once,
+        config.seed,
+    )
+    return float(result.returns.mean())
+
+
+def _tensorboard(path: Path, step: int) -> Any:
+    from ctmrl.errors import UsageError
+
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise UsageError(
+            "--tensorboard needs a package that is not installed: pip install 'ctmrl[tensorboard]'"
+        ) from None
+    return SummaryWriter(str(path / "tensorboard"), purge_step=step + 1)
+
+
+def _evaluate(
+    config: RunConfig,
+    learner: Learner,
+    folder: RunFolder,
+    split: Split,
+    best: dict[int, float],
+) -> dict[str, Any]:
+    from ctmrl import runs
+    from ctmrl.evaluate import evaluate_agent
+    from ctmrl.report import write_pictures
+    from meta_envs import task_set
+
+    groups = {"unseen": split.unseen, "seen": split.train}
+    tasks = task_set(config.env)
+    record = evaluate_agent(learner.agent, config, tasks, groups, best, config.seed)
+    write_pictures(record, folder.path)
+    folder.write_json(runs.EVALUATION, record)
+    return record
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The options that decide the defaults of all others."""
+
+    env: str = "point_robot_wind"
+    method: str = "ctmrl"
+    preset: str = "standard"
+
+
+def parse(arguments: list[str]) -> RunConfig:
+    """Read the command line: which environment, method and preset decides all other defaults.
+
+    Raises:
+        UsageError: an unknown environment or method.
+    """
+    import difflib
+
+    from ctmrl.config import RunConfig
+    from ctmrl.errors import UsageError
+    from ctmrl.methods import METHODS
+    from ctmrl.presets import known_preset, preset
+    from meta_envs import resolve
+
+    plain = [word for word in arguments if word not in ("-h", "--help")]
+    choice, _ = tyro.cli(Choice, args=plain, return_unknown_args=True, prog="python -m ctmrl.train")
+    try:
+        env = resolve(choice.env).name
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    if choice.method not in METHODS:
+        near = difflib.get_close_matches(choice.method, METHODS, n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        raise UsageError(f"no method '{choice.method}'{hint} (known: {', '.join(METHODS)})")
+    default = preset(env, choice.method, known_preset(choice.preset))
+    # tyro narrows `context` to the class of its default, so the method's own options appear.
+    parsed = tyro.cli(
+        tyro.conf.OmitArgPrefixes[RunConfig],
+        default=default,
+        args=arguments,
+        prog="python -m ctmrl.train",
+    )
+    return dataclasses.replace(parsed, env=env)
+
+
+def main() -> None:
+    """Train and print the result."""
+    from rich.console import Console
+
+    from ctmrl.report import result_table
+
+    config = parse(sys.argv[1:])
+    console = Console()
+    record = train(config, console)
+    console.print(result_table(record))
+    path = config.out or default_folder(config)
+    console.print(f"Pictures, metrics and checkpoint: {path}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    from ctmrl.console import run_command
+
+    sys.exit(run_command(main))
