@@ -2,7 +2,7 @@
 
     python benchmarks/env_steps.py --out benchmarks/results/env_steps.csv
 
-Both step the same environment with the same actions, in one process on one core, by turns, resets
+Both step the same environment with the same actions, in one thread of one process, by turns, resets
 included. A ratio is taken within one turn, so that a busy machine slows both sides of it.
 """
 
@@ -111,6 +111,8 @@ def machine() -> dict[str, str]:
     return {
         "cpu": cpu,
         "cores": str(os.cpu_count()),
+        # About 1 is this benchmark alone; more is a machine that did something else beside it.
+        "load": f"{os.getloadavg()[0]:.2f}",
         "system": platform.system(),
         "python": platform.python_version(),
         "numpy": np.__version__,
@@ -146,8 +148,6 @@ def main() -> int:
     except ValueError as mistake:
         errors.print(str(mistake), soft_wrap=True, markup=False, highlight=False)
         return 2
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     table = Table("environment", title=f"Steps a second, {options.num_envs} sub-environments")
     for heading in ("native", "native, best", "SyncVectorEnv", "ratio"):
         table.add_column(heading, justify="right")

@@ -21,13 +21,13 @@ class ActorCriticConfig:
 
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of actor, critics and value network."""
-    gamma: float = 0.9
+    gamma: float = 0.8
     """Discount factor."""
-    reward_scale: float = 100.0
+    reward_scale: float = 500.0
     """R: rewards count R times the entropy; the networks see rewards / entropy as 1 / (1/R)."""
     learning_rate: float = 1e-3
     """Learning rate of actor, critics and value network at the start."""
-    target_rate: float = 0.005
+    target_rate: float = 0.01
     """Share of the value network that goes into its target each step."""
     regularizer: float = 1e-3
     """Weight of mean^2 and log_std^2 of the policy, in units of the entropy."""
@@ -50,16 +50,19 @@ class ActorCriticConfig:
 
 
 class ActorCritic(nn.Module):
-    """Actor, twin critics, value network and, for BRAC, a dual critic, with their optimisers.
+    """Actor, twin critics, value network and, for BRAC, a dual critic.
 
     Losses are divided by the reward scale R: the optimum is the same as with rewards times R and
     entropy weight 1, and the networks' outputs stay of the size of a discounted return.
+
+    Actor, critics and value network share no parameter, so the sum of their losses trains all of
+    them in one backward pass; the dual critic has an optimiser of its own and is updated first.
     """
 
     def __init__(
         self, config: ActorCriticConfig, statistics: Statistics, act_dim: int, z_dim: int
     ) -> None:
-        """Build networks and optimisers; initial weights come from torch's global generator."""
+        """Build the networks; initial weights come from torch's global generator."""
         super().__init__()
         self.config = config
         self.entropy_coef = 1.0 / config.reward_scale
@@ -70,14 +73,13 @@ class ActorCritic(nn.Module):
         self.target_value = Critic(obs, z_dim, config.hidden, heads=1)
         self.target_value.load_state_dict(self.value.state_dict())
         self.target_value.requires_grad_(False)
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "critic": _adam(config.learning_rate, self.critic),
-            "actor": _adam(config.learning_rate, self.actor, self.value),
-        }
         self.multiplier: brac.Multiplier | None = None
+        self.dual_optimizer: torch.optim.Optimizer | None = None
         if config.behavior_regularization:
             self.dual_critic = Critic(obs, act_dim + z_dim, config.hidden, heads=1)
-            self.optimizers["dual_critic"] = _adam(config.dual_lr, self.dual_critic)
+            self.dual_optimizer = torch.optim.Adam(
+                self.dual_critic.parameters(), lr=config.dual_lr, fused=True
+            )
             self.multiplier = brac.Multiplier(
                 config.divergence_initial,
                 config.divergence_maximum,
@@ -85,10 +87,15 @@ class ActorCritic(nn.Module):
                 config.divergence_wind_up,
             )
 
-    def update(
+    def main_parameters(self) -> list[nn.Parameter]:
+        """What the sum of the losses trains: actor, critics and value network."""
+        modules = (self.actor, self.critic, self.value)
+        return [parameter for module in modules for parameter in module.parameters()]
+
+    def loss(
         self, batch: Transitions, z: Tensor, generator: torch.Generator
-    ) -> dict[str, Tensor]:
-        """One gradient step of every network, in the order of the field's code.
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Losses of critics, value network and actor; with BRAC, also updates the dual critic.
 
         Args:
             batch: n transitions.
@@ -96,39 +103,35 @@ class ActorCritic(nn.Module):
             generator: of the policy's noise.
 
         Returns:
-            Scalars by metric name.
+            Scalar sum of the losses, and scalars by metric name.
         """
-        metrics = {"loss/critic": self._update_critic(batch, z)}
+        target = self.critic_target(batch, z)
+        critic = (self.critic(batch.obs, batch.action, z) - target).square().mean(dim=1).sum()
         sample = self.actor.sample(batch.obs, z, generator)
-        divergence = None
-        if self.multiplier is not None:
-            action = sample.action
-            metrics["loss/dual_critic"] = self._update_dual(batch, z, action.detach(), generator)
-            divergence = self._divergence(batch, z, action)
-            metrics["divergence/mean"] = divergence.detach().mean()
-            metrics["divergence/coefficient"] = self.multiplier.coefficient()
-        self.critic.requires_grad_(False)
-        q = self.critic(batch.obs, sample.action, z).amin(dim=0)
-        self.critic.requires_grad_(True)
+        q = self.critic(batch.obs, sample.action, z, frozen=True).amin(dim=0)
         entropy_cost = self.entropy_coef * sample.log_prob
-        value_error = self.value(batch.obs, z)[0] - (q - entropy_cost).detach()
-        value_loss = value_error.square().mean()
+        value = (self.value(batch.obs, z)[0] - (q - entropy_cost).detach()).square().mean()
         regularizer = sample.mean.square().mean() + sample.log_std.square().mean()
-        actor_loss = (entropy_cost - q).mean()
-        actor_loss = actor_loss + self.entropy_coef * self.config.regularizer * regularizer
-        if divergence is not None and self.multiplier is not None:
-            weight = self.entropy_coef * self.multiplier.coefficient()
-            actor_loss = actor_loss + weight * divergence.mean()
-        # Actor and value network share no parameter, so one backward pass serves both.
-        self._step("actor", actor_loss + value_loss)
-        self._follow_value()
-        if divergence is not None and self.multiplier is not None:
+        actor = (entropy_cost - q).mean()
+        actor = actor + self.entropy_coef * self.config.regularizer * regularizer
+        metrics = {
+            "loss/critic": critic.detach(),
+            "loss/value": value.detach(),
+            "loss/actor": actor.detach(),
+            "policy/entropy": -sample.log_prob.detach().mean(),
+            "policy/q": q.detach().mean(),
+        }
+        if self.multiplier is not None:
+            metrics["loss/dual_critic"] = self._update_dual(
+                batch, z, sample.action.detach(), generator
+            )
+            divergence = self._divergence(batch, z, sample.action)
+            coefficient = self.multiplier.coefficient()
+            actor = actor + self.entropy_coef * coefficient * divergence.mean()
             self.multiplier.update(divergence)
-        metrics["loss/value"] = value_loss.detach()
-        metrics["loss/actor"] = actor_loss.detach()
-        metrics["policy/entropy"] = -sample.log_prob.detach().mean()
-        metrics["policy/q"] = q.detach().mean()
-        return metrics
+            metrics["divergence/mean"] = divergence.detach().mean()
+            metrics["divergence/coefficient"] = coefficient
+        return critic + value + actor, metrics
 
     def critic_target(self, batch: Transitions, z: Tensor) -> Tensor:
         """Targets y = r + gamma V_target(s', z), no value behind a terminal transition; [n]."""
@@ -137,26 +140,18 @@ class ActorCritic(nn.Module):
             target: Tensor = batch.reward + self.config.gamma * (1 - batch.terminal) * future
             return target
 
-    def _update_critic(self, batch: Transitions, z: Tensor) -> Tensor:
-        target = self.critic_target(batch, z)
-        loss = (self.critic(batch.obs, batch.action, z) - target).square().mean(dim=1).sum()
-        self._step("critic", loss)
-        detached: Tensor = loss.detach()
-        return detached
-
-    def _follow_value(self) -> None:
-        with torch.no_grad():
-            torch._foreach_lerp_(
-                list(self.target_value.parameters()),
-                list(self.value.parameters()),
-                self.config.target_rate,
-            )
+    @torch.no_grad()
+    def follow_value(self) -> None:
+        """Move the target value network towards the value network, after a gradient step."""
+        torch._foreach_lerp_(
+            list(self.target_value.parameters()),
+            list(self.value.parameters()),
+            self.config.target_rate,
+        )
 
     def _divergence(self, batch: Transitions, z: Tensor, action: Tensor) -> Tensor:
-        self.dual_critic.requires_grad_(False)
-        at_policy = self.dual_critic(batch.obs, action, z)[0]
-        at_data = self.dual_critic(batch.obs, batch.action, z)[0]
-        self.dual_critic.requires_grad_(True)
+        at_policy = self.dual_critic(batch.obs, action, z, frozen=True)[0]
+        at_data = self.dual_critic(batch.obs, batch.action, z, frozen=True)[0]
         return brac.dual_divergence(at_policy, at_data)
 
     def _update_dual(
@@ -177,16 +172,9 @@ class ActorCritic(nn.Module):
             self.dual_critic(batch.obs, batch.action, z)[0],
         )
         loss = brac.dual_critic_loss(divergence, penalty)
-        self._step("dual_critic", loss)
-        return loss.detach()
-
-    def _step(self, name: str, loss: Tensor) -> None:
-        optimizer = self.optimizers[name]
-        optimizer.zero_grad()
+        assert self.dual_optimizer is not None
+        self.dual_optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-
-
-def _adam(lr: float, *modules: nn.Module) -> torch.optim.Adam:
-    parameters = [parameter for module in modules for parameter in module.parameters()]
-    return torch.optim.Adam(parameters, lr=lr, fused=True)
+        self.dual_optimizer.step()
+        detached: Tensor = loss.detach()
+        return detached

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ctmrl.actor_critic import ActorCriticConfig
+from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods.base import MethodConfig
 
@@ -17,7 +20,7 @@ Preset = Literal["standard", "paper", "smoke"]
 class MetaTrainConfig:
     """Hyper-parameters of meta-training that no method changes."""
 
-    steps: int = 12_000
+    steps: int = 8_000
     """Gradient steps."""
     meta_batch: int = 16
     """B, training tasks in a batch, all different (fewer if there are fewer)."""
@@ -25,7 +28,7 @@ class MetaTrainConfig:
     """Transitions of each task for the actor-critic."""
     context_episodes: int = 2
     """Episodes behind one context."""
-    context_size: int = 32
+    context_size: int = 16
     """Transitions of one context, drawn from its episodes."""
     decay: bool = True
     """Let all learning rates fall linearly, to a hundredth at the end."""
@@ -66,3 +69,40 @@ class RunConfig:
     """Threads of the numerical libraries; part of what makes a run repeatable."""
     tensorboard: bool = False
     """Also write TensorBoard events (needs the extra: pip install 'ctmrl[tensorboard]')."""
+
+
+_SHARE = (0.0, 1.0)
+_BOUNDS: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("steps", "batch_size", "context_episodes", "context_size"), (1, math.inf)),
+    **dict.fromkeys(("scored_episodes", "repetitions", "threads", "z_dim"), (1, math.inf)),
+    **dict.fromkeys(("hidden", "encoder_hidden", "predictor_hidden"), (1, math.inf)),
+    **dict.fromkeys(("random_episodes", "policy_episodes", "extra_negatives"), (0, math.inf)),
+    **dict.fromkeys(("learning_rate", "encoder_lr", "dual_lr", "regularizer"), (0, math.inf)),
+    **dict.fromkeys(("gamma", "target_rate", "eta", "warm_up", "refresh"), _SHARE),
+    **dict.fromkeys(("reward_scale", "tau"), (1e-9, math.inf)),
+    "meta_batch": (2, math.inf),
+    "seed": (0, 2**63 - 1),
+}
+"""Least and largest value of the options that have them."""
+
+
+def check_settings(config: Any) -> None:
+    """Check that every number is in its range.
+
+    Args:
+        config: a RunConfig, or another dataclass with fields of the same names.
+
+    Raises:
+        UsageError: the first one that is not.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            check_settings(value)
+        elif field.name in _BOUNDS:
+            low, high = _BOUNDS[field.name]
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not all(low <= number <= high for number in numbers):
+                wanted = f"at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
+                option = field.name.replace("_", "-")
+                raise UsageError(f"--{option} must be {wanted}, got {value}")

@@ -17,17 +17,17 @@ from datagen.dataset import DatasetError
 
 
 def run_command(command: Callable[[], None]) -> int:
-    """Run a command; a user's mistake becomes one sentence on stderr.
+    """Run a command; a user's mistake, or a disk's refusal, becomes one sentence on stderr.
 
     Returns:
-        The exit code: 0, 2 for a mistake, 130 for Ctrl-C.
+        The exit code: 0, 2 for a mistake or a refusal, 130 for Ctrl-C.
     """
     try:
         command()
     except KeyboardInterrupt:
         sys.stderr.write("Stopped. The same command goes on from the last checkpoint.\n")
         return 130
-    except (UsageError, DatasetError) as error:
+    except (UsageError, DatasetError, OSError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
     return 0
@@ -78,7 +78,8 @@ class TrainingDisplay:
     def show(self, metrics: Mapping[str, float | None]) -> None:
         """Show a row of metrics."""
         step = int(metrics["step"] or 0)
-        self._return = metrics["return/training_tasks"] or self._return
+        measured = metrics["return/training_tasks"]
+        self._return = self._return if measured is None else measured
         elapsed = max(time.monotonic() - self._begun, 1e-6)
         rate = (step - self.start) / elapsed
         if self._live:
@@ -87,11 +88,11 @@ class TrainingDisplay:
             grid.add_row(self._progress)
             grid.add_row(self._table(metrics))
             self._live.update(grid)
-        elif metrics["return/training_tasks"] is not None:
+        elif measured is not None:
             left = (self.steps - step) / max(rate, 1e-6)
             self.console.print(
                 f"step {step}/{self.steps}: {self._losses(metrics)}; {self._usage(metrics)}"
-                f"return on training tasks {self._return:.2f}; "
+                f"return on training tasks {measured:.2f}; "
                 f"{elapsed:.0f} s, about {left:.0f} s left",
                 soft_wrap=True,
                 highlight=False,

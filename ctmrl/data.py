@@ -117,6 +117,18 @@ class OfflineData:
         obs, action, _, next_obs, reward, terminal = torch.split(rows, [o, a, 1, o, 1, 1], dim=-1)
         return Transitions(obs, action, reward[:, 0], next_obs, terminal[:, 0])
 
+    def check_episodes(self, sets: int, episodes: int) -> None:
+        """Check that every task has the episodes that `contexts` needs.
+
+        Raises:
+            UsageError: a task has fewer than sets * episodes episodes.
+        """
+        if sets * episodes > self.episodes:
+            raise UsageError(
+                f"contexts need {sets} x {episodes} different episodes a task, the dataset has "
+                f"{self.episodes}: collect more or lower --context-episodes"
+            )
+
     def contexts(
         self, tasks: Tensor, sets: int, episodes: int, n: int, generator: torch.Generator
     ) -> Tensor:
@@ -135,11 +147,7 @@ class OfflineData:
         Raises:
             UsageError: a task has fewer than sets * episodes episodes.
         """
-        if sets * episodes > self.episodes:
-            raise UsageError(
-                f"contexts need {sets} x {episodes} different episodes a task, the dataset has "
-                f"{self.episodes}: collect more or lower --context-episodes"
-            )
+        self.check_episodes(sets, episodes)
         count = self._task_episodes[tasks]
         keys = torch.rand(len(tasks), int(count.max()), generator=generator)
         keys.masked_fill_(torch.arange(keys.shape[1]) >= count[:, None], 2.0)

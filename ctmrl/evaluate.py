@@ -111,6 +111,8 @@ def main(config: EvaluateConfig) -> None:
 
     from ctmrl import runs
     from ctmrl.agent import load_agent
+    from ctmrl.config import check_settings
+    from ctmrl.errors import UsageError
     from ctmrl.files import write_whole
     from ctmrl.methods.base import Dimensions
     from ctmrl.presets import config_from_settings
@@ -123,23 +125,28 @@ def main(config: EvaluateConfig) -> None:
     if config.repetitions is not None:
         protocol = dataclasses.replace(run_config.meta_test, repetitions=config.repetitions)
         run_config = dataclasses.replace(run_config, meta_test=protocol)
+    seed = run_config.seed if config.seed is None else config.seed
+    if config.fresh < 0:
+        raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
+    with runs.fitting(config.run / runs.CONFIG):
+        check_settings(dataclasses.replace(run_config, seed=seed))
+        dims = Dimensions(*(stored["dimensions"][name] for name in Dimensions._fields))
+        groups = {name: np.array(rows) for name, rows in stored["groups"].items()}
+        best = {int(task): value for task, value in stored["best_behavior"].items()}
     settle_threads(run_config.threads)
-    dims = Dimensions(*(stored["dimensions"][name] for name in Dimensions._fields))
     state = runs.load_checkpoint(config.run / runs.CHECKPOINT)
-    agent = load_agent(run_config, dims, state)
-    if int(state["step"]) < dims.steps:
+    with runs.fitting(config.run / runs.CHECKPOINT):
+        agent = load_agent(run_config, dims, state)
+        step = int(state["step"])
+    if step < dims.steps:
         raise runs.RunError(
-            f"{config.run} stopped at step {int(state['step'])} of {dims.steps}: "
+            f"{config.run} stopped at step {step} of {dims.steps}: "
             "give its training command again to finish it"
         )
-    seed = run_config.seed if config.seed is None else config.seed
     tasks = task_set(run_config.env)
     if config.fresh:
         tasks = tasks.sample(config.fresh, seed)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
-    else:
-        groups = {name: np.array(rows) for name, rows in stored["groups"].items()}
-        best = {int(task): value for task, value in stored["best_behavior"].items()}
     record = evaluate_agent(agent, run_config, tasks, groups, best, seed)
     Console().print(result_table(record))
     if config.out is not None:

@@ -44,12 +44,25 @@ class Learner:
             self.actor_critic = ActorCritic(
                 config.actor_critic, statistics, data.act_dim, config.context.z_dim
             )
+        data.check_episodes(self.method.context_sets, config.training.context_episodes)
         self.generator = torch.Generator().manual_seed(config.seed)
-        encoder = torch.optim.Adam(
-            self.method.parameters(), lr=config.context.encoder_lr, fused=True
+        main = torch.optim.Adam(
+            [
+                {"params": list(self.method.parameters()), "lr": config.context.encoder_lr},
+                {
+                    "params": self.actor_critic.main_parameters(),
+                    "lr": config.actor_critic.learning_rate,
+                },
+            ],
+            fused=True,
         )
-        self.optimizers = {"encoder": encoder, **self.actor_critic.optimizers}
-        self._rates = {name: opt.param_groups[0]["lr"] for name, opt in self.optimizers.items()}
+        self.optimizers: dict[str, torch.optim.Optimizer] = {"main": main}
+        if self.actor_critic.dual_optimizer is not None:
+            self.optimizers["dual_critic"] = self.actor_critic.dual_optimizer
+        self._rates = {
+            name: [group["lr"] for group in optimizer.param_groups]
+            for name, optimizer in self.optimizers.items()
+        }
         self._every = torch.arange(len(data))
 
     @property
@@ -79,23 +92,24 @@ class Learner:
         contexts = self._draw(tasks, method.context_sets)
         batch = self.data.transitions(tasks, config.batch_size, self.generator)
         z = method.encoder(contexts)
-        loss, metrics = method.context_loss(contexts, z, self.generator)
-        self.optimizers["encoder"].zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.optimizers["encoder"].step()
-        # The first set's contexts; the actor-critic must not send gradients to the encoder.
-        z = z[0].detach()
-        metrics["contexts/between"] = z.std(dim=0).mean()
-        repeated = z.repeat_interleave(config.batch_size, dim=0)
-        metrics |= self.actor_critic.update(batch, repeated, self.generator)
+        context_loss, metrics = method.context_loss(contexts, z, self.generator)
+        # The first set's contexts, detached: the actor-critic must not train the encoder.
+        given = z[0].detach()
+        repeated = given.repeat_interleave(config.batch_size, dim=0)
+        policy_loss, more = self.actor_critic.loss(batch, repeated, self.generator)
+        self.optimizers["main"].zero_grad()
+        (context_loss + policy_loss).backward()  # type: ignore[no-untyped-call]
+        self.optimizers["main"].step()
+        self.actor_critic.follow_value()
         self.step += 1
-        return metrics
+        return metrics | more | {"contexts/between": given.std(dim=0).mean()}
 
     def _set_rates(self) -> None:
         left = 1.0 - self.step / self.config.steps
         factor = LAST_RATE + (1 - LAST_RATE) * left if self.config.decay else 1.0
         for name, optimizer in self.optimizers.items():
-            optimizer.param_groups[0]["lr"] = self._rates[name] * factor
+            for group, rate in zip(optimizer.param_groups, self._rates[name], strict=True):
+                group["lr"] = rate * factor
 
     def _modules(self) -> dict[str, nn.Module]:
         return {"method": self.method, "actor_critic": self.actor_critic}

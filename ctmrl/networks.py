@@ -156,12 +156,17 @@ class Critic(nn.Module):
             self.weights.append(torch.stack([layer.weight.detach().T for layer in layers]))
             self.biases.append(torch.stack([layer.bias.detach()[None] for layer in layers]))
 
-    def forward(self, obs: Tensor, *others: Tensor) -> Tensor:
-        """Values [heads, n] of observations [n, O] and what stands beside them, each [n, D]."""
+    def forward(self, obs: Tensor, *others: Tensor, frozen: bool = False) -> Tensor:
+        """Values [heads, n] of observations [n, O] and what stands beside them, each [n, D].
+
+        With `frozen`, gradients reach the inputs but not the weights.
+        """
         x = torch.cat([self.standardize(obs), *others], dim=-1)
         h = x.expand(len(self.weights[0]), *x.shape)
         last = len(self.weights) - 1
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if frozen:
+                weight, bias = weight.detach(), bias.detach()
             h = torch.baddbmm(bias, h, weight)
             if index < last:
                 h = torch.relu(h)

@@ -13,27 +13,26 @@ from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
 from meta_envs import ENVIRONMENTS
 
-_STANDARD = MetaTrainConfig()
-_STANDARD_AC = ActorCriticConfig()
-_PAPER_AC = ActorCriticConfig(hidden=(256, 256, 256), learning_rate=3e-4)
-_PAPER_SIZES: dict[str, Any] = {
+CODES = {"point_robot": 8, "point_robot_wind": 8, "sparse_point_robot": 4}
+"""Codes of the paper's headline results, by environment."""
+PAPER_CONTEXT_SIZE = {"point_robot": 1024, "point_robot_wind": 256, "sparse_point_robot": 1024}
+STANDARD_TRAINING: dict[str, dict[str, Any]] = {
+    "point_robot": {},
+    "point_robot_wind": {},
+    "sparse_point_robot": {},
+}
+"""Where an environment's standard training differs from the defaults of MetaTrainConfig."""
+PAPER_CONTEXT = {
+    "z_dim": 20,
     "encoder_hidden": (200, 200, 200),
     "encoder_lr": 3e-4,
-    "z_dim": 20,
+    "predictor_hidden": (256, 256, 256),
+    "warm_up": 0.3,
+    "code_contrast_weight": 1.0,
+    "cross_prediction_weight": 1.0,
+    "contrast_weight": 1.0,
 }
-_PAPER_PREDICTORS: dict[str, Any] = {"predictor_hidden": (256, 256, 256)}
-_PAPER_CONTEXT = {"point_robot": 1024, "point_robot_wind": 256, "sparse_point_robot": 1024}
-_PAPER_CODES = {"point_robot": 8, "point_robot_wind": 8, "sparse_point_robot": 4}
-_CONTEXT_STANDARD: dict[str, dict[str, Any]] = {
-    "point_robot": {},
-    "point_robot_wind": {},
-    "sparse_point_robot": {},
-}
-_TRAIN_STANDARD: dict[str, dict[str, Any]] = {
-    "point_robot": {},
-    "point_robot_wind": {},
-    "sparse_point_robot": {},
-}
+SMOKE_CONTEXT = {"codes": 3, "z_dim": 4, "encoder_hidden": (16,), "predictor_hidden": (16,)}
 
 
 def known_preset(name: str) -> Preset:
@@ -61,34 +60,49 @@ def preset(env: str, method: str, name: Preset, **changes: Any) -> RunConfig:
     Raises:
         UsageError: no preset for that environment.
     """
-    if env not in _PAPER_CODES:
-        raise UsageError(f"no preset for '{env}' (there are: {', '.join(_PAPER_CODES)})")
-    config_class = METHODS[method].config
-    fields = {field.name for field in dataclasses.fields(config_class)}
-    wanted: dict[str, Any] = {"codes": _PAPER_CODES[env], **_CONTEXT_STANDARD[env]}
-    training = dataclasses.replace(_STANDARD, **_TRAIN_STANDARD[env])
-    actor_critic = _STANDARD_AC
-    meta_test = MetaTestConfig()
+    if env not in CODES:
+        raise UsageError(f"no preset for '{env}' (there are: {', '.join(CODES)})")
+    training = MetaTrainConfig(**STANDARD_TRAINING[env])
+    actor_critic, meta_test = ActorCriticConfig(), MetaTestConfig()
+    context: dict[str, Any] = {"codes": CODES[env]}
     if name == "paper":
-        wanted |= _PAPER_SIZES | _PAPER_PREDICTORS
+        context |= PAPER_CONTEXT
+        size = PAPER_CONTEXT_SIZE[env]
+        # The field draws a context's transitions from all of a task's data.
+        episodes = size // ENVIRONMENTS[env].horizon
         training = MetaTrainConfig(
             steps=65_000,
             batch_size=256,
-            context_size=_PAPER_CONTEXT[env],
+            context_episodes=episodes,
+            context_size=size,
             decay=False,
-            context_episodes=_PAPER_CONTEXT[env] // ENVIRONMENTS[env].horizon // 10 or 1,
         )
-        actor_critic = _PAPER_AC
+        actor_critic = ActorCriticConfig(
+            hidden=(256, 256, 256),
+            gamma=0.9,
+            reward_scale=100.0,
+            learning_rate=3e-4,
+            target_rate=0.005,
+        )
     elif name == "smoke":
-        wanted |= {"codes": 3, "encoder_hidden": (16,), "predictor_hidden": (16,), "z_dim": 4}
+        context |= SMOKE_CONTEXT
         training = MetaTrainConfig(
             steps=60, meta_batch=5, batch_size=7, context_size=11, context_episodes=1
         )
-        actor_critic = dataclasses.replace(_STANDARD_AC, hidden=(16,))
+        actor_critic = ActorCriticConfig(hidden=(16,))
         meta_test = MetaTestConfig(random_episodes=2, policy_episodes=2, repetitions=1)
-    context = config_class(**{key: wanted[key] for key in wanted if key in fields})
+    config_class = METHODS[method].config
+    known = {field.name for field in dataclasses.fields(config_class)}
+    wanted = {key: value for key, value in context.items() if key in known}
     return RunConfig(
-        training, actor_critic, context, meta_test, env=env, method=method, preset=name, **changes
+        training,
+        actor_critic,
+        config_class(**wanted),
+        meta_test,
+        env=env,
+        method=method,
+        preset=name,
+        **changes,
     )
 
 
@@ -107,7 +121,7 @@ def config_from_settings(stored: dict[str, Any], path: Path) -> RunConfig:
         base = preset(settings["env"], settings["method"], settings["preset"])
         restored: RunConfig = _restored(base, settings)
         return restored
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise UsageError(
             f"{path} does not fit this version of ctmrl ({error}): train again with --restart"
         ) from None

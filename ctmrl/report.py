@@ -1,17 +1,24 @@
-"""An evaluation's record as a table and as pictures; needs neither torch nor an environment."""
+"""`python -m ctmrl.report RUNS`: finished runs as a table over seeds, and as pictures.
+
+Needs neither torch nor an environment: the runs' folders are enough.
+"""
 
 from __future__ import annotations
 
+import sys
+from dataclasses import dataclass
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from rich.table import Table
 
 from ctmrl.files import write_whole
+from ctmrl.summary import Result, collate, find_records, interquartile_mean, interval, to_csv
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -111,7 +118,8 @@ def _draw_curve(axes: Axes, name: str, group: dict[str, Any], record: dict[str, 
         axes.axvline(change, color="0.8", lw=1, zorder=0)
     near = [value for key, value in group["references"].items() if key != "random"]
     # The first points, on an empty context, may lie far below: cut them off rather than the rest.
-    top, bottom = max([*near, mean.max()]), min([*near, mean[1:].min(), np.median(low)])
+    lowest = mean[1:].min(initial=mean[-1])
+    top, bottom = max([*near, mean.max()]), min([*near, lowest, np.median(low)])
     axes.set_ylim(bottom - 0.35 * (top - bottom), top + 0.1 * (top - bottom))
     axes.set_xlabel(f"adaptation episodes ({change} random, then with the policy)")
     axes.set_title(f"{TITLES[name]}: {group['return']:.2f}")
@@ -170,10 +178,73 @@ def _parameter(record: dict[str, Any]) -> str:
 
 def plane(contexts: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Principal components: contexts [n, Z] -> points [n, 2] and their shares of the variance."""
-    centred = contexts - contexts.mean(axis=0)
+    # A single context, or contexts of a single number, have a plane too: the rest of it is 0.
+    missing = [(0, max(2 - size, 0)) for size in contexts.shape]
+    centred = np.pad(contexts - contexts.mean(axis=0), missing)
     _, sizes, directions = np.linalg.svd(centred, full_matrices=False)
     # A direction's sign is arbitrary: let its largest entry be positive.
     largest = np.abs(directions).argmax(axis=1)
     directions = directions * np.sign(directions[np.arange(len(directions)), largest])[:, None]
     share = sizes**2 / max(float((sizes**2).sum()), 1e-12)
-    return centred @ directions[:2].T, share[:2]
+    return (centred @ directions[:2].T)[: len(contexts)], share[:2]
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Put the results of several seeds together: mean, 95% interval, inter-quartile mean."""
+
+    runs: Annotated[list[Path], tyro.conf.Positional]
+    """Run folders, or folders of run folders."""
+    csv: Path | None = None
+    """Also write one line a seed into this file."""
+
+
+def summary_table(env: str, group: str, results: list[Result]) -> Table:
+    """Returns over seeds of the methods on one group of tasks, beside the references."""
+    table = Table(title=f"{env}, {TITLES[group]}")
+    table.add_column("")
+    for column in ("return", "95% interval", "IQM", "score", "seeds"):
+        table.add_column(column, justify="right")
+    for result in results:
+        low, high = interval(result.returns)
+        table.add_row(
+            result.method,
+            f"{result.returns.mean():.3f}",
+            f"{low:.3f} to {high:.3f}" if len(result.seeds) > 1 else "-",
+            f"{interquartile_mean(result.returns):.3f}",
+            f"{result.scores.mean():.1f}",
+            " ".join(map(str, result.seeds)),
+            style="bold",
+        )
+    references = results[0].references
+    for key, label in LABELS.items():
+        if key in references:
+            normal = score(references[key], references)
+            table.add_row(
+                label, f"{references[key]:.3f}", "", "", "-" if normal is None else f"{normal:.1f}"
+            )
+    return table
+
+
+def main(config: ReportConfig) -> None:
+    """Read the runs and print."""
+    from rich.console import Console
+
+    records = find_records(config.runs)
+    results = collate(records)
+    console = Console()
+    for env, group in dict.fromkeys((result.env, result.group) for result in results):
+        rows = [result for result in results if (result.env, result.group) == (env, group)]
+        console.print(summary_table(env, group, rows))
+        for result in rows:
+            values = ", ".join(f"{value:.3f}" for value in result.returns)
+            console.print(f"{result.method}, seed by seed: {values}", soft_wrap=True)
+    if config.csv is not None:
+        config.csv.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(config.csv, to_csv(results).encode())
+
+
+if __name__ == "__main__":
+    from ctmrl.console import run_command
+
+    sys.exit(run_command(lambda: main(tyro.cli(ReportConfig))))

@@ -8,6 +8,8 @@ import io
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,17 @@ CONFIG, METRICS, CHECKPOINT, EVALUATION = (
     "checkpoint.pt",
     "evaluation.json",
 )
+
+RUN_FILES = (
+    EVALUATION,
+    CHECKPOINT,
+    METRICS,
+    "tensorboard",
+    "adaptation.png",
+    "contexts.png",
+    CONFIG,
+)
+"""All that a run's folder holds, in an order in which any beginning may be missing."""
 
 
 class RunError(UsageError):
@@ -72,6 +85,22 @@ def load_checkpoint(path: Path) -> dict[str, Tensor]:
     return state
 
 
+@contextmanager
+def fitting(path: Path) -> Iterator[None]:
+    """Turn what goes wrong while a stored file is put to use into a RunError.
+
+    Raises:
+        RunError: it is sound, but not of this run or not of this version of the package.
+    """
+    try:
+        yield
+    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise RunError(
+            f"{path} does not fit its run ({reason}): train again with --restart"
+        ) from None
+
+
 class RunFolder:
     """The folder of one run, locked for as long as this object lives.
 
@@ -85,7 +114,7 @@ class RunFolder:
         Args:
             path: the folder.
             settings: all that decides the run's results; goes into config.json.
-            restart: throw away what is there.
+            restart: throw away the run that is there.
 
         Raises:
             RunError: the folder holds a run with other settings, something that is not a run, or
@@ -95,25 +124,50 @@ class RunFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(path, os.O_RDONLY)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunError(f"another process is at work in {path}: wait for it") from None
         except OSError as error:
             raise RunError(f"{path} cannot be written to ({error.strerror}): try --out") from None
-        config = path / CONFIG
+        try:
+            self._begin(settings, restart)
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin(self, settings: dict[str, Any], restart: bool) -> None:
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(f"another process is at work in {self.path}: wait for it") from None
+        config = self.path / CONFIG
         if restart and config.exists():
-            for entry in path.iterdir():
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            self._throw_away()
         if config.exists():
             self._compare(read_json(config), settings)
-        elif any(entry for entry in path.iterdir() if not entry.name.endswith(".partial")):
-            raise RunError(f"{path} holds files that are not of a run: choose another --out")
+        elif self._entries():
+            raise RunError(f"{self.path} holds files that are not of a run: choose another --out")
         else:
             write_whole(config, to_json(settings))
 
     def close(self) -> None:
         """Let others use the folder."""
         os.close(self._lock)
+
+    def _entries(self) -> set[str]:
+        """Names of all that is there, but for files that were never finished."""
+        names = (entry.name for entry in self.path.iterdir())
+        return {name for name in names if not name.endswith(".partial")}
+
+    def _throw_away(self) -> None:
+        foreign = sorted(self._entries() - set(RUN_FILES))
+        if foreign:
+            raise RunError(
+                f"{self.path} also holds {foreign[0]}, which is not of a run: "
+                "choose another --out, or move it away"
+            )
+        for entry in (self.path / name for name in RUN_FILES):
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink(missing_ok=True)
 
     def _compare(self, there: dict[str, Any], asked: dict[str, Any]) -> None:
         # Through JSON, because a tuple comes back as a list.
@@ -144,12 +198,19 @@ class RunFolder:
         write_whole(self.path / CHECKPOINT, buffer.getvalue())
 
     def rewind_metrics(self, step: int) -> None:
-        """Forget the metrics of steps after `step`, which will be taken again."""
+        """Forget the metrics of steps after `step`, which will be taken again.
+
+        Raises:
+            RunError: the file is damaged.
+        """
         path = self.path / METRICS
         if not path.exists():
             return
-        lines = path.read_text().split("\n")[:-1]
-        kept = [line for line in lines[1:] if int(line.partition(",")[0]) <= step]
+        try:
+            lines = path.read_text().split("\n")[:-1]
+            kept = [line for line in lines[1:] if int(line.partition(",")[0]) <= step]
+        except ValueError as error:
+            raise RunError(f"{path} is damaged ({error}): train again with --restart") from None
         write_whole(path, "".join(f"{line}\n" for line in [*lines[:1], *kept]).encode())
 
     def append_metrics(self, row: dict[str, float | None]) -> None:

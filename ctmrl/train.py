@@ -38,14 +38,24 @@ class Split:
 
 
 def split_tasks(dataset: Dataset, validate: bool) -> Split:
-    """The dataset's split, or with `validate` one inside its training tasks."""
+    """The dataset's split, or with `validate` one inside its training tasks.
+
+    Raises:
+        UsageError: too few training tasks to hold one out.
+    """
     import numpy as np
 
+    from ctmrl.errors import UsageError
     from meta_envs import task_set
 
     if not validate:
         return Split(dataset.train_tasks, task_set(dataset.env).test_tasks)
     held_out = dataset.train_tasks[2::5]
+    if not len(held_out):
+        raise UsageError(
+            f"--validate needs at least 3 training tasks, {dataset.path} has "
+            f"{len(dataset.train_tasks)}: collect more"
+        )
     return Split(np.setdiff1d(dataset.train_tasks, held_out), held_out)
 
 
@@ -105,12 +115,17 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
 
     Returns:
         The evaluation's record.
+
+    Raises:
+        UsageError: settings or a dataset that cannot be used.
     """
     from ctmrl import runs
+    from ctmrl.config import check_settings
     from ctmrl.data import OfflineData
     from ctmrl.meta_train import Learner
     from ctmrl.threads import settle_threads
 
+    check_settings(config)
     settle_threads(config.threads)
     dataset = open_data(config)
     split = split_tasks(dataset, config.validate)
@@ -136,13 +151,15 @@ def default_folder(config: RunConfig) -> Path:
 
 
 def _meta_train(config: RunConfig, learner: Learner, folder: RunFolder, console: Console) -> None:
+    from ctmrl import runs
     from ctmrl.console import TrainingDisplay
     from ctmrl.errors import UsageError
     from ctmrl.meta_train import meta_train
 
     state = folder.checkpoint()
     if state is not None:
-        learner.load(state)
+        with runs.fitting(folder.path / runs.CHECKPOINT):
+            learner.load(state)
         console.print(f"Going on at step {learner.step} of {config.training.steps}.")
     folder.rewind_metrics(learner.step)
     steps = config.training.steps

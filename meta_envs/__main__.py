@@ -157,8 +157,8 @@ def _references(row: Row, task: int | None) -> Table:
         groups[f"task {task}"] = np.array([task])
     table = Table(
         "controller",
-        title="Reference returns, means over the tasks, and normalised scores",
-        caption=f"random: {RANDOM_EPISODES} episodes a task; 0 is random, 100 the exact optimum",
+        title="Mean returns and normalised scores",
+        caption=f"random: {RANDOM_EPISODES} episodes a task; score: 0 random, 100 oracle",
         title_justify="left",
         caption_justify="left",
     )

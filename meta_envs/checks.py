@@ -67,6 +67,10 @@ def check_rows(tasks: Any, task_set: TaskSet) -> NDArray[np.int64]:
         raise ValueError(f"{task_set.env}: tasks must be a sequence of integers, got {tasks!r}")
     if not len(tasks):
         raise ValueError(f"{task_set.env}: tasks is empty; at least one task is needed")
+    if isinstance(tasks, np.ndarray) and tasks.ndim == 1 and tasks.dtype.kind in "iu":
+        outside = tasks[(tasks < 0) | (tasks >= len(task_set))]
+        if not outside.size:
+            return tasks.astype(np.int64)
     return np.array([task_set.check_task(task) for task in tasks], dtype=np.int64)
 
 

@@ -177,7 +177,7 @@ def draw_point_robot(
     )
     distance = math.dist(path[-1].tolist(), goal.tolist())
     _draw_caption(pen, len(path) - 1, distance, radius, wind)
-    return np.array(image.resize((SIZE, SIZE), Image.Resampling.LANCZOS))
+    return np.array(image.reduce(SHARPNESS))
 
 
 def _draw_plane(pen: _Pen, view: View, half_circle: bool) -> None:

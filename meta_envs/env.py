@@ -218,7 +218,8 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         """Start episodes.
 
         Args:
-            seed: one integer (sub-environment i gets seed + i) or one for each.
+            seed: one integer (sub-environment i gets seed + i) or one for each; a sub-environment
+                without one goes on with its random stream.
             options: "task" (an integer or one for each) moves sub-environments to other tasks;
                 "reset_mask" (bool [num_envs]) leaves the others as they are.
         """
@@ -263,10 +264,9 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
                 f"sub-environments {np.flatnonzero(self._over).tolist()} are over: call "
                 "reset(options={'reset_mask': mask}) first, or choose another autoreset_mode"
             )
-        definition = self.definition
-        next_state = definition.advance(state, checked, self._params)
-        reward, terms = definition.reward(state, checked, next_state, self._params)
-        terminated = definition.terminated(next_state)
+        next_state = self.definition.advance(state, checked, self._params)
+        reward, terms = self.definition.reward(state, checked, next_state, self._params)
+        terminated = self.definition.terminated(next_state)
         self._state = next_state
         self._clock += 1
         stepped = self._every
@@ -284,7 +284,7 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         info = self._info(terms, stepped)
         if self._any_over and self.autoreset_mode is AutoresetMode.SAME_STEP:
             self._reset_finished(info)
-        return definition.observe(self._state), reward, terminated, truncated, info
+        return self.definition.observe(self._state), reward, terminated, truncated, info
 
     def _truncated(self) -> NDArray[np.bool_]:
         """Whose time is up; nearly always nobody's, and then nothing is compared."""

@@ -46,6 +46,7 @@ class Streams(Sequence[np.random.Generator]):
         return some
 
     def reseed(self, row: int, seed: int | None) -> None:
-        """Start one sub-environment's stream anew."""
-        self._seeds[row] = seed
-        self._made.pop(row, None)
+        """Start one sub-environment's stream anew; without a seed it goes on as it is."""
+        if seed is not None:
+            self._seeds[row] = seed
+            self._made.pop(row, None)

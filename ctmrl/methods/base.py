@@ -19,7 +19,7 @@ class MethodConfig:
 
     z_dim: int = 20
     """Size of a context."""
-    encoder_hidden: tuple[int, ...] = (128, 128)
+    encoder_hidden: tuple[int, ...] = (64, 64)
     """Widths of the encoder's hidden layers."""
     encoder_lr: float = 1e-3
     """Learning rate of the encoder and all that is trained with it, at the start."""

@@ -36,19 +36,19 @@ class CTMRLConfig(MethodConfig):
     """Learning rate of the codes, equation (2)."""
     extra_negatives: int = 8
     """M, negatives of a task that is alone with its code."""
-    warm_up: float = 0.3
+    warm_up: float = 0.1
     """Share of the steps before the codebook is used; contexts are collected in its last third."""
     refresh: float = 0.05
     """Share of the steps between two K-means refreshes."""
-    code_contrast_weight: float = 1.0
+    code_contrast_weight: float = 0.1
     """Weight of L_C, averaged over tasks."""
-    cross_prediction_weight: float = 1.0
+    cross_prediction_weight: float = 0.1
     """Weight of L_pre^cro, averaged over tasks and transitions."""
-    contrast_weight: float = 1.0
+    contrast_weight: float = 0.1
     """Weight of L_contra."""
     metric_weight: float = 0.0
     """Weight of FOCAL's metric loss, which the released code adds (10) and the paper lacks."""
-    predictor_hidden: tuple[int, ...] = (128, 128)
+    predictor_hidden: tuple[int, ...] = (64, 64)
     """Widths of the predictors' hidden layers."""
 
 

@@ -51,6 +51,10 @@ def test_what_neither_shell_can_be_made_with(
     ("kwargs", "message"),
     [
         ({"tasks": [0, 100]}, "point_robot has tasks 0 to 99, got task=100"),
+        ({"tasks": np.array([0, 100])}, "point_robot has tasks 0 to 99, got task=100"),
+        ({"tasks": np.array([-1, 1])}, "point_robot has tasks 0 to 99, got task=-1"),
+        ({"tasks": np.array([0.0, 1.0])}, "point_robot: task must be an integer, got "),
+        ({"tasks": np.array([[0, 1]])}, "point_robot: task must be an integer, got "),
         ({"tasks": [0, 1.0]}, r"point_robot: task must be an integer, got 1.0 \(float\)"),
         ({"tasks": [[0], [1]]}, r"point_robot: task must be an integer, got \[0\] \(list\)"),
         ({"tasks": 7}, "point_robot: tasks must be a sequence of integers, got 7"),

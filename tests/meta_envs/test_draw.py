@@ -116,10 +116,10 @@ def test_wind_is_a_field_of_arrows_and_one_in_the_caption() -> None:
     assert not near(draw(), WIND, 60).any()
 
 
-@pytest.mark.parametrize("angle", range(0, 360, 30))
+@pytest.mark.parametrize("angle", range(0, 360, 45))
 def test_the_arrow_points_where_the_wind_blows(angle: int) -> None:
     direction = np.array([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
-    for strength in (0.002, 0.04, 0.07):
+    for strength in (0.002, 0.07):
         picture = draw(PATH[:1], wind=strength * direction)
         arrow = near(picture, WIND, 100)[PLOT_HEIGHT + 2 :, 345:]
         down, right = np.nonzero(arrow)
@@ -136,10 +136,12 @@ def test_the_arrow_points_where_the_wind_blows(angle: int) -> None:
 
 def test_the_half_circle_is_there_where_goals_lie_on_it() -> None:
     start = np.zeros((1, 2))
+    still, windy = draw(start), draw(start, wind=(0.0, 0.0))
     for angle in (30, 60, 120, 150):
         point = [math.cos(math.radians(angle)), math.sin(math.radians(angle))]
-        assert not near(draw(start), WHITE, 12)[pixel(point, start)]
-        assert near(draw(start, wind=(0.0, 0.0)), WHITE)[pixel((0.35, 0.3), start, wind=True)]
+        assert not near(still, WHITE, 12)[pixel(point, start)]
+    point = [math.cos(math.radians(48)), math.sin(math.radians(48))]
+    assert near(windy, WHITE)[pixel(point, start, wind=True)]
 
 
 @pytest.mark.parametrize("wind", [None, (0.05, 0.05)])

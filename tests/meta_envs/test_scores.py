@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from meta_envs import ENVIRONMENTS, normalized_score, reference_returns, task_set
+from meta_envs import ENVIRONMENTS, MetaEnv, normalized_score, reference_returns, task_set
 
 
 def random_return(name: str, task: tuple[float, float], seed: int, episodes: int) -> list[float]:
@@ -54,6 +54,24 @@ def test_references_are_reproducible_and_of_the_tasks_given() -> None:
 @pytest.mark.usefixtures("untouched_global_rng")
 def test_references_touch_no_shared_generator() -> None:
     reference_returns(task_set("point_robot"), episodes=2)
+
+
+def test_a_return_ends_with_its_episode(noisy_robot: str) -> None:
+    tasks = task_set(noisy_robot)
+    found = reference_returns(tasks, episodes=1)["oracle"]
+    lengths = []
+    for task in range(len(tasks)):
+        env = MetaEnv(noisy_robot, task=task)
+        position, _ = env.reset(seed=task)
+        rewards: list[float] = []
+        terminated = False
+        while not terminated and len(rewards) < env.definition.horizon:
+            aim = 10.0 * (tasks.params[task] - position)
+            position, reward, terminated, _, _ = env.step(aim)
+            rewards.append(reward)
+        lengths.append(len(rewards))
+        assert found[task] == pytest.approx(sum(rewards), abs=1e-5)
+    assert len(set(lengths)) > 2
 
 
 def test_the_normalized_score_by_hand() -> None:

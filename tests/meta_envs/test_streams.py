@@ -29,6 +29,7 @@ def test_reseeding_starts_one_stream_anew() -> None:
     streams.reseed(1, 9)
     assert streams[1].uniform() == alone[1].uniform()
     alone[0].uniform()
+    streams.reseed(0, None)
     assert streams[0].uniform() == alone[0].uniform()
 
 

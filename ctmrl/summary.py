@@ -1,0 +1,139 @@
+"""Results of several seeds: mean, interval, inter-quartile mean."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctmrl.errors import UsageError
+
+RESAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class Result:
+    """One group of tasks of one method on one environment, over seeds.
+
+    Attributes:
+        env: environment.
+        method: method.
+        group: unseen, seen or fresh.
+        seeds: the runs' seeds, sorted.
+        returns: each seed's mean return.
+        scores: each seed's normalised score, NaN where there is none.
+        references: mean returns of the references on the same tasks.
+    """
+
+    env: str
+    method: str
+    group: str
+    seeds: tuple[int, ...]
+    returns: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    references: dict[str, float]
+
+
+def find_records(paths: list[Path]) -> list[dict[str, Any]]:
+    """Read the evaluations of all runs in or below some folders, in the order of their paths.
+
+    Raises:
+        UsageError: there is none, or one cannot be read.
+    """
+    files = sorted({file for path in paths for file in path.glob("**/evaluation.json")})
+    if not files:
+        where = ", ".join(map(str, paths))
+        raise UsageError(f"no finished run in {where}: python -m ctmrl.train makes one")
+    records = []
+    for file in files:
+        try:
+            record = json.loads(file.read_bytes())
+            record["run"] = str(file.parent)
+            record["groups"], record["env"], record["method"], record["seed"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UsageError(
+                f"{file} is not an evaluation of a run ({error}): move it away"
+            ) from None
+        records.append(record)
+    return records
+
+
+def collate(records: list[dict[str, Any]]) -> list[Result]:
+    """Group records by environment, method and group of tasks.
+
+    Raises:
+        UsageError: two runs of one seed, or runs scored on different tasks.
+    """
+    rows: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    for record in records:
+        for group in record["groups"]:
+            rows.setdefault((record["env"], record["method"], group), []).append(record)
+    results = []
+    for (env, method, group), members in rows.items():
+        members.sort(key=lambda record: int(record["seed"]))
+        for one, other in pairwise(members):
+            if one["seed"] == other["seed"]:
+                raise UsageError(
+                    f"{one['run']} and {other['run']} both have seed {one['seed']} of {method} on "
+                    f"{env}: name the folders of one setting only"
+                )
+            if one["groups"][group]["tasks"] != other["groups"][group]["tasks"]:
+                raise UsageError(
+                    f"{one['run']} and {other['run']} were scored on different {group} tasks: "
+                    "report them apart"
+                )
+        groups = [member["groups"][group] for member in members]
+        results.append(
+            Result(
+                env,
+                method,
+                group,
+                tuple(int(member["seed"]) for member in members),
+                np.array([one["return"] for one in groups], dtype=np.float64),
+                np.array([one["score"] for one in groups], dtype=np.float64),
+                groups[0]["references"],
+            )
+        )
+    return results
+
+
+def interval(values: NDArray[np.float64], seed: int = 0) -> tuple[float, float]:
+    """95% bootstrap interval of the mean over seeds (percentiles of resampled means)."""
+    if len(values) < 2:
+        return float("nan"), float("nan")
+    from scipy.stats import bootstrap
+
+    found = bootstrap(
+        (values,),
+        np.mean,
+        n_resamples=RESAMPLES,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def interquartile_mean(values: NDArray[np.float64]) -> float:
+    """Mean of the middle half of the values."""
+    from scipy.stats import trim_mean
+
+    return float(trim_mean(values, 0.25))
+
+
+def to_csv(results: list[Result]) -> str:
+    """One line a seed: environment, method, group, seed, return, score."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(["env", "method", "group", "seed", "return", "score"])
+    for result in results:
+        for seed, value, score in zip(result.seeds, result.returns, result.scores, strict=True):
+            row = [result.env, result.method, result.group, seed]
+            writer.writerow([*row, f"{value:.4f}", f"{score:.2f}"])
+    return buffer.getvalue()

@@ -1,0 +1,271 @@
+"""The card of a dataset: the README.md in its folder, made from its index alone."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from datagen.budgets import budget
+from datagen.columns import COLUMNS
+from meta_envs import resolve, task_set
+from meta_envs.registry import definition
+
+CARD_FILE = "README.md"
+"""Name of the card in the dataset's folder."""
+
+_COLUMN_MEANS = {
+    "observations": "observation before the action",
+    "actions": "action of the behaviour policy, in [-1, 1]",
+    "rewards": "reward of the step",
+    "next_observations": "observation after the step, also at an episode's end",
+    "terminals": "the environment ended the episode; never the time limit",
+    "timeouts": "the time limit ended the episode",
+    "episode": "number of the episode, from 0, without gaps",
+    "checkpoint": "training steps of the policy that acted",
+    "dense_rewards": "dense reward of the step, which the behaviour policy learned from",
+}
+
+
+def rows_text(tasks: Sequence[int]) -> str:
+    """Task numbers as `--tasks` takes them: [0, 1, 2, 5] is `0-2,5`."""
+    spans: list[list[int]] = []
+    for task in tasks:
+        if spans and task == spans[-1][1] + 1:
+            spans[-1][1] = task
+        else:
+            spans.append([task, task])
+    return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in spans)
+
+
+def remake_command(index: Mapping[str, Any]) -> str:
+    """The command that makes a dataset again, byte for byte, without its `--out`.
+
+    Args:
+        index: content of `dataset.json`.
+    """
+    words = ["python", "-m", "datagen.collect", "--env", index["env"], "--budget", index["budget"]]
+    episodes = index["config"]["episodes"]
+    if budget(index["env"], index["budget"]).episodes != episodes:
+        words += ["--episodes", str(episodes)]
+    tasks = [record["task"] for record in index["tasks"]]
+    if len(tasks) < len(task_set(index["env"])):
+        words += ["--tasks", rows_text(tasks)]
+    return shlex.join([*words, "--seed", str(index["seed"])])
+
+
+def named_checkpoints(record: Mapping[str, Any]) -> dict[str, str]:
+    """The first, the middle and the last checkpoint of a task's returns, by these words.
+
+    The middle is left out where there are only two, and the first where there is only one.
+    """
+    marks = sorted(record["returns"]["behavior"], key=int)
+    named = {"first": marks[0], "middle": marks[len(marks) // 2], "last": marks[-1]}
+    if len(marks) < 3:
+        del named["middle"]
+    if len(marks) < 2:
+        del named["first"]
+    return named
+
+
+def mean_returns(records: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Returns averaged over a group of tasks.
+
+    Args:
+        records: the tasks' records of an index, at least one.
+
+    Returns:
+        `random`, `expert`, `best` and `best deterministic` (of each task's best checkpoint),
+        and `first`, `middle` and `last`, of those checkpoints as far as there are so many.
+    """
+    returns = [record["returns"] for record in records]
+    found = {
+        "random": [one["random"] for one in returns],
+        **{
+            name: [one["behavior"][mark] for one in returns]
+            for name, mark in named_checkpoints(records[0]).items()
+        },
+        "best": [max(one["behavior"].values()) for one in returns],
+        "best deterministic": [max(one["deterministic"].values()) for one in returns],
+        "expert": [one["expert"] for one in returns],
+    }
+    return {name: float(sum(values) / len(values)) for name, values in found.items()}
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    lines = [head, ["---"] * len(head), *rows]
+    return [f"| {' | '.join(cells)} |" for cells in lines]
+
+
+def _front_matter(index: Mapping[str, Any], rows: int) -> list[str]:
+    lines = [
+        "---",
+        f"pretty_name: {index['env_id']} ({index['budget']}, seed {index['seed']})",
+        "license: mit",
+        "task_categories:",
+        "- reinforcement-learning",
+        "tags:",
+        *(f"- {tag}" for tag in ("offline-rl", "meta-rl", "gymnasium", index["env"])),
+        "size_categories:",
+        f"- {_size_category(rows)}",
+        "configs:",
+        f"- config_name: {index['env']}",
+        "  data_files:",
+    ]
+    for split in ("train", "test"):
+        files = [record["file"] for record in index["tasks"] if record["split"] == split]
+        if files:
+            lines += [f"  - split: {split}", "    path:", *(f"    - {file}" for file in files)]
+    return [*lines, "---", ""]
+
+
+def _size_category(rows: int) -> str:
+    bounds = [(10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M")]
+    return next((name for bound, name in bounds if rows < bound), "1M<n<10M")
+
+
+def _about(index: Mapping[str, Any]) -> list[str]:
+    env, records = index["env"], index["tasks"]
+    row, config = resolve(env), index["config"]
+    marks = config["checkpoints"]
+    names = ", ".join(f"`{name}`" for name in index["param_names"])
+    expert = (
+        "the exact optimum"
+        if "oracle" in definition(env).controllers
+        else "the task's best deterministic checkpoint"
+    )
+    return [
+        f"# {index['env_id']}: offline meta-reinforcement-learning data",
+        "",
+        f"Transitions of `{index['env_id']}` on {len(records)} of its {len(task_set(env))} tasks. "
+        f"What varies from task to task: {row.varies} (parameters {names}). "
+        f"An episode has at most {row.horizon} steps.",
+        "",
+        "On each task one soft actor-critic was trained from scratch. At each of "
+        f"{len(marks)} checkpoints, after {marks[0]:,} to {marks[-1]:,} environment steps, its "
+        f"stochastic policy played {config['episodes']} episodes. The data are a mixture of poor, "
+        "middling and good behaviour.",
+        "",
+        "Made again, byte for byte, by",
+        "",
+        "```",
+        remake_command(index),
+        "```",
+        "",
+        f"Returns are undiscounted sums of `rewards`, means over tasks; the expert is {expert}.",
+        "",
+    ]
+
+
+def _returns_table(index: Mapping[str, Any]) -> list[str]:
+    groups = {
+        split: [record for record in index["tasks"] if record["split"] == split]
+        for split in ("train", "test")
+    }
+    present = {split: records for split, records in groups.items() if records}
+    rows = [
+        [what, *(f"{sum(one[key] for one in records):,}" for records in present.values())]
+        for what, key in (
+            ("transitions", "transitions"),
+            ("episodes", "episodes"),
+            ("bytes", "bytes"),
+        )
+    ]
+    rows.insert(0, ["tasks", *(str(len(records)) for records in present.values())])
+    means = {split: mean_returns(records) for split, records in present.items()}
+    marks = named_checkpoints(index["tasks"][0])
+    titles = {
+        "random": "random policy",
+        **{name: f"{name} checkpoint, {int(mark):,} steps" for name, mark in marks.items()},
+        "best": "best checkpoint of each task",
+        "best deterministic": "best checkpoint of each task, deterministic",
+        "expert": "expert",
+    }
+    rows += [
+        [f"return: {title}", *(f"{means[split][name]:.2f}" for split in present)]
+        for name, title in titles.items()
+    ]
+    head = ["", *(f"{split} tasks" for split in present)]
+    return ["## Sizes and returns", "", *_table(head, rows), ""]
+
+
+def _columns_table(index: Mapping[str, Any]) -> list[str]:
+    env = definition(index["env"])
+    widths = {
+        "observations": env.observation_space.shape[0],
+        "next_observations": env.observation_space.shape[0],
+        "actions": env.action_space.shape[0],
+    }
+    rows = [
+        [
+            f"`{name}`",
+            dtype.name,
+            f"N x {widths[name]}" if name in widths else "N",
+            _COLUMN_MEANS[name],
+        ]
+        for name, dtype in COLUMNS.items()
+        if env.sparse or name != "dense_rewards"
+    ]
+    return [
+        "## Columns",
+        "",
+        "One HDF5 file a task, `task_003.h5` for task 3. All columns of a file have the same",
+        "length N; its attribute `meta` is a JSON text with everything else. `dataset.json` lists",
+        "the files with their SHA-256, the tasks' parameters and the returns of every checkpoint.",
+        "",
+        *_table(["column", "type", "shape", "meaning"], rows),
+        "",
+        "```python",
+        "from datagen.dataset import open_dataset",
+        "",
+        'dataset = open_dataset("path/to/this/folder")',
+        "data = dataset.read(int(dataset.train_tasks[0]))",
+        "print(data.observations.shape, data.meta['params'])",
+        "```",
+        "",
+    ]
+
+
+def _settings_tables(index: Mapping[str, Any]) -> list[str]:
+    config = dict(index["config"])
+    learner = config.pop("sac")
+    settings = [*sorted({**config, "seed": index["seed"]}.items()), *sorted(learner.items())]
+    shown = [[f"`{key}`", _setting(value)] for key, value in settings]
+    versions = [[name, version] for name, version in sorted(index["versions"].items())]
+    return [
+        "## Settings",
+        "",
+        "The behaviour policies are Stable-Baselines3's SAC. `datagen/budgets.py` says what each",
+        "setting is; what is not listed has Stable-Baselines3's default.",
+        "",
+        *_table(["setting", "value"], shown),
+        "",
+        "## Versions",
+        "",
+        *_table(["package", "version"], versions),
+        "",
+        f"SHA-256 of the task set: `{index['task_hash']}`",
+    ]
+
+
+def _setting(value: object) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def card(index: Mapping[str, Any]) -> str:
+    """The card's text, Markdown with Hugging Face's front matter; the same index, the same text.
+
+    Args:
+        index: content of `dataset.json`; `sha256` is not needed.
+    """
+    total = sum(record["transitions"] for record in index["tasks"])
+    lines = [
+        *_front_matter(index, total),
+        *_about(index),
+        *_returns_table(index),
+        *_columns_table(index),
+        *_settings_tables(index),
+    ]
+    return "\n".join(lines) + "\n"

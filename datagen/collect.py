@@ -1,0 +1,260 @@
+"""Command line: collect a dataset, one behaviour policy a task, rolled out at its checkpoints.
+
+python -m datagen.collect --env point_robot_wind --budget paper --workers 2
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from datagen.budgets import budget
+from datagen.card import rows_text
+from datagen.estimate import seconds_of
+from datagen.finished import (
+    check_origin,
+    remove_stale,
+    scan,
+    without_versions,
+    write_summary,
+)
+from datagen.job import Job, collect_task, origin
+from datagen.plan import Plan, parse_shard, parse_tasks
+from datagen.progress import CollectionDisplay, duration
+from datagen.workers import WorkerError, run_jobs
+from meta_envs import resolve, task_set
+
+MOST_WORKERS = 8
+"""Default number of workers on a machine with more cores than that; each needs 0.4 GB."""
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Collect an offline dataset: train a behaviour policy on every task and roll it out.
+
+    Interrupted and run again, the same command does only what is missing, and ends in the same
+    bytes. Exit code: 0 done, 1 failed on the way, 2 wrong usage, 130 interrupted.
+    """
+
+    env: str
+    """Environment: its short name, its id or the field's hyphenated name."""
+    budget: Annotated[str, tyro.conf.arg(metavar="paper|standard|smoke")] = "standard"
+    """How much to collect: as in the papers, to suit a small machine, or just enough to test."""
+    tasks: Annotated[str | None, tyro.conf.arg(metavar="0-9,12")] = None
+    """Tasks to collect; all by default."""
+    shard: Annotated[str | None, tyro.conf.arg(metavar="I/N")] = None
+    """Collect every N-th of these tasks from the I-th on, I from 0, to share them with machines
+    that see the same folder."""
+    seed: int = 0
+    """Seed of everything random."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """The dataset's folder; datasets/ENV by default."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Processes, one thread each; by default one a core, 8 at most."""
+    episodes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Episodes of each checkpoint, instead of the budget's, for a smaller dataset."""
+    dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Say what would be done and how long it would take, and touch nothing."""
+
+
+class CollectionError(RuntimeError):
+    """A collection failed on the way; the message is one sentence."""
+
+
+class InterruptedCollectionError(RuntimeError):
+    """A collection was stopped by Ctrl-C; the message is one sentence."""
+
+    def __init__(self, done: int, total: int) -> None:
+        """Say how far it got."""
+        super().__init__(f"stopped with {done} of {total} tasks done; the same command continues")
+
+
+def plan_of(config: CollectConfig) -> Plan:
+    """The plan of a command line.
+
+    Raises:
+        ValueError: an option is wrong; the message says which and how to do better.
+    """
+    env = resolve(config.env).name
+    wanted = budget(env, config.budget, config.episodes)
+    tasks = parse_shard(config.shard, parse_tasks(config.tasks, task_set(env)))
+    if config.seed < 0:
+        raise ValueError(f"--seed must not be negative, got {config.seed}")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    workers = min(cores or 1, MOST_WORKERS) if config.workers is None else config.workers
+    if workers < 1:
+        raise ValueError(f"--workers must be at least 1, got {workers}")
+    folder = config.out or Path("datasets") / env
+    return Plan(env, tasks, wanted, config.seed, folder, workers)
+
+
+def missing_tasks(plan: Plan) -> tuple[int, ...]:
+    """The tasks that have no finished file yet.
+
+    Raises:
+        DatasetError: a file in the folder is damaged or was collected in another way. Other
+            versions of packages are no difference as long as no task is missing.
+    """
+    asked = origin(plan.env, plan.budget, plan.seed)
+    found = scan(plan.folder, without_versions(asked))
+    missing = tuple(task for task in plan.tasks if task not in found)
+    if missing:
+        for one in found.values():
+            check_origin(one, asked)
+    return missing
+
+
+def collect(plan: Plan, console: Console) -> dict[str, Any]:
+    """Collect what is missing, then write the index and the card.
+
+    Args:
+        plan: what to do; its folder is made if it is not there.
+        console: where progress is shown.
+
+    Returns:
+        The index.
+
+    Raises:
+        ValueError: the folder cannot be made or written to.
+        DatasetError: a file in the folder is damaged or was collected in another way.
+        CollectionError: a worker failed or a file could not be written.
+        InterruptedCollectionError: Ctrl-C.
+    """
+    _prepare(plan.folder)
+    missing = missing_tasks(plan)
+    finished = len(plan.tasks) - len(missing)
+    if finished:
+        console.print(f"{finished} of {len(plan.tasks)} tasks are already finished.")
+    jobs = [Job(plan.env, task, plan.budget, plan.seed, plan.folder) for task in missing]
+    with CollectionDisplay(console, len(plan.tasks), len(jobs), plan.budget) as display:
+        try:
+            _run(jobs, plan.workers, display)
+        except KeyboardInterrupt:
+            raise InterruptedCollectionError(display.finished, len(plan.tasks)) from None
+        except WorkerError as error:
+            raise CollectionError(
+                f"task {jobs[error.index].task}: {error}; {display.finished} of "
+                f"{len(plan.tasks)} tasks are done, and the same command continues"
+            ) from None
+        finally:
+            remove_stale(plan.folder)
+    try:
+        return write_summary(plan.folder, origin(plan.env, plan.budget, plan.seed))
+    except OSError as error:
+        raise CollectionError(
+            f"all tasks are done, but not the index ({error}); the same command continues"
+        ) from error
+
+
+def _prepare(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"--out {folder} cannot be made ({error.strerror}), choose another"
+        ) from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"--out {folder} cannot be written to, choose another")
+    remove_stale(folder)
+
+
+def _run(jobs: Sequence[Job], workers: int, display: CollectionDisplay) -> None:
+    with closing(run_jobs(collect_task, jobs, workers)) as events:
+        for event in events:
+            task = jobs[event.index].task
+            if event.kind == "started":
+                display.started(task)
+            elif isinstance(event.value, int):
+                display.step(task, event.value)
+            elif event.value is not None:
+                display.done(task, event.value)
+
+
+def describe(plan: Plan, console: Console) -> None:
+    """Print what a plan would do and about how long it would take; touches nothing.
+
+    Raises:
+        DatasetError: as `collect` would.
+    """
+    missing = missing_tasks(plan)
+    budget, rows = plan.budget, plan.rows * len(plan.tasks)
+    marks = budget.checkpoints
+    lines = {
+        "dataset": f"{plan.folder}, budget {budget.name}, seed {plan.seed}",
+        "tasks": f"{rows_text(plan.tasks)} ({len(plan.tasks)} tasks, {len(missing)} to collect)",
+        "training": f"{marks[-1]:,} steps a task, the first {budget.random_steps:,} random",
+        "checkpoints": f"{len(marks)}, from {marks[0]:,} to {marks[-1]:,} steps",
+        "episodes": f"{budget.episodes} each checkpoint, {budget.total_episodes:,} a task",
+        "size": f"at most {rows:,} rows, {rows * plan.row_bytes / 1e6:.1f} MB",
+    }
+    for name, text in lines.items():
+        _say(console, f"{name + ':':13}{text}")
+    if missing:
+        left = dataclasses.replace(plan, tasks=missing)
+        time = duration(seconds_of(left))
+        _say(console, f"{'time:':13}about {time} with {_count(plan.workers, 'worker')}")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def _say(console: Console, text: str, style: str | None = None) -> None:
+    console.print(text, style=style, soft_wrap=True, markup=False, highlight=False)
+
+
+def _conclude(plan: Plan, index: dict[str, Any], console: Console) -> None:
+    size = sum(record["bytes"] for record in index["tasks"])
+    rows = sum(record["transitions"] for record in index["tasks"])
+    folder = shlex.quote(str(plan.folder))
+    _say(
+        console,
+        f"{plan.folder}: {_count(len(index['tasks']), 'task')}, {rows:,} transitions, "
+        f"{size / 1e6:.1f} MB",
+    )
+    _say(console, f"look at it: python -m datagen.inspect {folder}")
+    if sum(record["split"] == "train" for record in index["tasks"]) > 1:
+        _say(console, f"learn from it: python -m ctmrl.train --env {plan.env} --data {folder}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Returns:
+        Exit code: 0 done, 1 failed on the way, 2 wrong usage, 130 interrupted.
+    """
+    config = tyro.cli(CollectConfig, prog="python -m datagen.collect", args=arguments)
+    out, err = Console(), Console(stderr=True)
+    try:
+        plan = plan_of(config)
+        if config.dry_run:
+            describe(plan, out)
+        else:
+            _conclude(plan, collect(plan, out), out)
+    except CollectionError as error:
+        _say(err, str(error), "red")
+        return 1
+    except ValueError as error:
+        _say(err, str(error), "red")
+        return 2
+    except InterruptedCollectionError as error:
+        _say(err, str(error))
+        return 130
+    except KeyboardInterrupt:
+        _say(err, "stopped; the same command continues")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

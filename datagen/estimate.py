@@ -1,0 +1,80 @@
+"""How long a collection would take, from a second or two of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datagen.budgets import Budget
+from datagen.plan import Plan
+from datagen.rollout import rollout
+
+MEASURED_SECONDS = 1.5
+"""Seconds of learning a measurement takes, at least."""
+START_SECONDS = 5.0
+"""Seconds until a new worker has loaded torch."""
+
+
+class _EnoughError(Exception):
+    """The measurement has lasted long enough."""
+
+
+class _Stopwatch:
+    """Times the steps of a training from the moment its updates begin."""
+
+    def __init__(self, first: int) -> None:
+        self.first = first
+        self.marks: list[tuple[int, float]] = []
+
+    def report(self, step: int) -> None:
+        if step <= self.first:
+            return
+        self.marks.append((step, time.perf_counter()))
+        if self.marks[-1][1] - self.marks[0][1] > MEASURED_SECONDS:
+            raise _EnoughError
+
+    def seconds_a_step(self) -> float:
+        (a, begin), (b, end) = self.marks[0], self.marks[-1]
+        return (end - begin) / (b - a)
+
+
+def seconds_a_learning_step(env: str, budget: Budget) -> float:
+    """Measured seconds of one environment step and one update, on this machine and one thread."""
+    from datagen.behavior import REPORT_EVERY, train_policies
+
+    random_steps = 2 * REPORT_EVERY
+    # The first updates are slow: memory is allocated and code is loaded.
+    watch = _Stopwatch(random_steps + 2 * REPORT_EVERY)
+    endless = dataclasses.replace(
+        budget, steps=10**6, random_steps=random_steps, checkpoints=(10**6,)
+    )
+    with suppress(_EnoughError):
+        train_policies(env, 0, endless, 0, watch.report)
+    return watch.seconds_a_step()
+
+
+def seconds_a_rollout(env: str, episodes: int) -> float:
+    """Measured seconds of one checkpoint's episodes."""
+
+    def still(obs: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return zeros, zeros
+
+    from meta_envs.registry import definition
+
+    zeros = np.zeros((episodes, *definition(env).action_space.shape), np.float32)
+    begin = time.perf_counter()
+    rollout(env, 0, still, 0, episodes, np.random.default_rng(0))
+    return time.perf_counter() - begin
+
+
+def seconds_of(plan: Plan) -> float:
+    """About how long the tasks of a plan take, all of them, its workers side by side."""
+    budget = plan.budget
+    task = budget.updates * seconds_a_learning_step(plan.env, budget)
+    task += len(budget.checkpoints) * seconds_a_rollout(plan.env, budget.episodes)
+    turns = -(-len(plan.tasks) // plan.workers)
+    return START_SECONDS + turns * task

@@ -1,0 +1,166 @@
+"""What a collection finds finished in a dataset's folder, and the index it makes of that."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from datagen.card import CARD_FILE, card
+from datagen.dataset import DatasetError, task_of, write_index
+from datagen.files import digest, read_bytes, write_whole
+from datagen.task_files import parse_task
+
+_PARTIAL = re.compile(r"\..+\.(\d+)\.partial")
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A whole, verified task file.
+
+    Attributes:
+        path: the file.
+        meta: what it says of itself.
+        record: its record for the index.
+    """
+
+    path: Path
+    meta: dict[str, Any]
+    record: dict[str, Any]
+
+
+def read_finished(path: Path) -> Finished:
+    """Read and verify one task's file.
+
+    Raises:
+        DatasetError: it is damaged.
+    """
+    content = read_bytes(path, "delete it")
+    data = parse_task(path, content, {})
+    record = {
+        **{key: data.meta[key] for key in ("task", "split", "params", "returns")},
+        "file": path.name,
+        "bytes": len(content),
+        "sha256": digest(content),
+        "transitions": len(data),
+        "episodes": int(data.episode[-1]) + 1,
+    }
+    return Finished(path, data.meta, record)
+
+
+def task_paths(folder: Path) -> list[Path]:
+    """Paths of all task files in a folder, by task; none if there is no folder."""
+    if not folder.is_dir():
+        return []
+    found = ((task_of(path), path) for path in folder.iterdir())
+    return [path for task, path in sorted((t, p) for t, p in found if t is not None)]
+
+
+def scan(folder: Path, origin: Mapping[str, Any]) -> dict[int, Finished]:
+    """Read every task file of a folder, and make sure that it belongs to a dataset.
+
+    Args:
+        folder: the dataset's folder, or none yet.
+        origin: what the files of the dataset share, as `datagen.job.origin` has it; without
+            `versions`, these are compared among the files only.
+
+    Returns:
+        The finished tasks in order.
+
+    Raises:
+        DatasetError: a file is damaged, or was collected in another way.
+    """
+    shared = dict(origin)
+    found = {}
+    for path in task_paths(folder):
+        one = read_finished(path)
+        check_origin(one, shared)
+        shared.setdefault("versions", one.meta["versions"])
+        found[int(one.meta["task"])] = one
+    return found
+
+
+def check_origin(one: Finished, origin: Mapping[str, Any]) -> None:
+    """Raise a DatasetError that names the first difference of a file from what was asked for."""
+    there = dict(_leaves({key: one.meta.get(key) for key in origin}))
+    asked = dict(_leaves(origin))
+    for key in sorted({*there, *asked}):
+        if there.get(key) != asked.get(key):
+            raise DatasetError(
+                one.path,
+                f"was collected with {key} {_value(there, key)}, not {_value(asked, key)}",
+                "give the same options as then, choose another --out, or delete the file",
+            )
+
+
+def _leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """The values of nested objects by their path, such as `config.sac.gamma`."""
+    if not isinstance(value, Mapping):
+        yield name, value
+        return
+    for key, below in value.items():
+        yield from _leaves(below, f"{name}.{key}" if name else str(key))
+
+
+def _value(leaves: Mapping[str, object], key: str) -> str:
+    return repr(leaves[key]) if key in leaves else "nothing of that name"
+
+
+def without_versions(origin: Mapping[str, Any]) -> dict[str, Any]:
+    """An origin that files collected with other versions of the packages share."""
+    return {key: value for key, value in origin.items() if key != "versions"}
+
+
+def remove_stale(folder: Path) -> None:
+    """Delete what writers that are no more left half written."""
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        match = _PARTIAL.fullmatch(path.name)
+        if match and not _alive(int(match[1])):
+            path.unlink(missing_ok=True)
+
+
+def _alive(pid: int) -> bool:
+    if pid == os.getpid():
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
+def write_summary(folder: Path, origin: Mapping[str, Any]) -> dict[str, Any]:
+    """Write `dataset.json` and the card from the task files that are there.
+
+    Args:
+        folder: with at least one task file.
+        origin: as for `scan`; the versions are those of the files.
+
+    Returns:
+        The index.
+
+    Raises:
+        DatasetError: a task file is damaged or was collected in another way.
+        OSError: the disk is full.
+    """
+    asked = without_versions(origin)
+    while True:
+        found = scan(folder, asked)
+        some = next(iter(found.values()))
+        index = {
+            **asked,
+            "versions": some.meta["versions"],
+            "tasks": [one.record for one in found.values()],
+        }
+        write_index(folder, index)
+        write_whole(folder / CARD_FILE, card(index).encode())
+        # Another shard that finished meanwhile may have written its index before this one.
+        if task_paths(folder) == [one.path for one in found.values()]:
+            return index

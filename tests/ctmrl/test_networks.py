@@ -1,0 +1,189 @@
+"""The networks against torch's own distributions and layers, and plain loops."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.distributions import Independent, Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
+from torch.nn import functional
+
+from ctmrl.networks import Actor, ContextEncoder, Critic, Predictors, Standardize, mlp
+from tests.ctmrl.examples import ACT, BATCH, LENGTH, OBS, Z, contexts, generator, normal, statistics
+
+HIDDEN = (23, 19)
+
+
+def perceptron(x: Tensor, net: nn.Sequential) -> Tensor:
+    """ReLU layers, from the parameters alone."""
+    parameters = [parameter.detach() for parameter in net.parameters()]
+    pairs = list(zip(parameters[::2], parameters[1::2], strict=True))
+    for index, (weight, bias) in enumerate(pairs):
+        x = x @ weight.T + bias
+        if index < len(pairs) - 1:
+            x = x.clamp_min(0)
+    return x
+
+
+def test_mlp_has_relu_between_layers_and_none_at_the_end() -> None:
+    net = mlp(OBS, HIDDEN, ACT)
+    assert [tuple(p.shape) for p in net.parameters()] == [
+        (23, OBS), (23,), (19, 23), (19,), (ACT, 19), (ACT,),
+    ]  # fmt: skip
+    x = 9 * normal(BATCH, OBS).float()
+    torch.testing.assert_close(net(x), perceptron(x, net))
+    assert (net(x) < 0).any()
+
+
+def test_standardize_and_constant_columns() -> None:
+    mean, std = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 0.0, 0.5])
+    found = Standardize(mean, std)(torch.tensor([[3.0, 7.0, 3.0], [1.0, -7.0, 2.0]]))
+    assert found.tolist() == [[1.0, 0.0, 0.0], [0.0, 0.0, -2.0]]
+    assert set(Standardize(mean, std).state_dict()) == {"mean", "scale"}
+
+
+@pytest.mark.parametrize("next_obs", [True, False])
+def test_a_context_is_the_mean_of_its_transitions_encodings(next_obs: bool) -> None:
+    stats, h = statistics(next_obs), contexts()
+    encoder = ContextEncoder(stats.context, OBS, HIDDEN, Z)
+    z = encoder(h)
+    assert z.shape == (2, BATCH, Z)
+    mean, std = stats.context
+    for k, i in itertools.product(range(2), (0, 4, BATCH - 1)):
+        total = torch.zeros(Z)
+        for t in range(LENGTH):
+            obs, action, reward, after = torch.split(h[k, i, t], [OBS, ACT, 1, OBS])
+            seen = [obs, action, reward] + [after - obs] * next_obs
+            total += torch.tanh(perceptron((torch.cat(seen) - mean) / std, encoder.net))
+        torch.testing.assert_close(z[k, i], total / LENGTH)
+
+
+def test_without_s_prime_the_encoder_does_not_see_it() -> None:
+    h = contexts()
+    changed = h.clone()
+    changed[..., -OBS:] += 1.0
+    for next_obs in (True, False):
+        encoder = ContextEncoder(statistics(next_obs).context, OBS, HIDDEN, Z)
+        assert encoder(h).equal(encoder(changed)) is not next_obs
+
+
+def test_encodings_are_between_minus_1_and_1() -> None:
+    encoder = ContextEncoder(statistics().context, OBS, HIDDEN, Z)
+    encoded = encoder.encode(1e6 * contexts())
+    assert encoded.abs().max() <= 1.0
+    assert encoded.isfinite().all()
+
+
+def actor() -> Actor:
+    return Actor(statistics().obs, Z, HIDDEN, ACT).double()
+
+
+def test_the_log_probability_is_that_of_a_tanh_gaussian() -> None:
+    policy, obs, z = actor(), normal(BATCH, OBS), normal(BATCH, Z, seed=1)
+    sample = policy.sample(obs, z, generator())
+    mean, log_std = policy(obs, z)
+    gaussian = Independent(Normal(mean, log_std.exp()), 1)
+    wanted = TransformedDistribution(gaussian, [TanhTransform()])
+    log_prob: Tensor = wanted.log_prob(sample.action)  # type: ignore[no-untyped-call] # torch's
+    assert sample.log_prob.shape == (BATCH,)
+    torch.testing.assert_close(sample.log_prob, log_prob, rtol=1e-4, atol=1e-3)
+    assert sample.mean.equal(mean)
+    assert sample.log_std.equal(log_std)
+
+
+def test_actions_are_reparameterised_with_the_generators_noise() -> None:
+    policy, obs, z = actor(), normal(BATCH, OBS), normal(BATCH, Z, seed=1)
+    mean, log_std = policy(obs, z)
+    noise = torch.randn(BATCH, ACT, generator=generator(3))
+    sample = policy.sample(obs, z, generator(3))
+    torch.testing.assert_close(sample.action, torch.tanh(mean + log_std.exp() * noise))
+    for gradient in torch.autograd.grad(sample.action.sum(), tuple(policy.net.parameters())):
+        assert gradient.abs().sum() > 0
+
+
+def test_the_distribution_of_actions() -> None:
+    policy = actor()
+    obs, z = (normal(1, size).expand(20_011, size) for size in (OBS, Z))
+    with torch.no_grad():
+        sample = policy.sample(obs, z, generator())
+    pre_tanh = torch.atanh(sample.action)
+    np.testing.assert_allclose(pre_tanh.mean(dim=0), sample.mean[0], atol=0.04)
+    np.testing.assert_allclose(pre_tanh.std(dim=0), sample.log_std[0].exp(), rtol=0.03)
+
+
+def test_acting_is_the_tanh_of_the_mean_without_a_gradient() -> None:
+    policy, obs, z = actor(), normal(BATCH, OBS), normal(BATCH, Z, seed=1)
+    action = policy.act(obs, z)
+    torch.testing.assert_close(action, torch.tanh(policy(obs, z)[0]))
+    assert not action.requires_grad
+
+
+def test_the_actor_standardises_observations_and_takes_contexts_as_they_are() -> None:
+    policy, obs, z = actor(), normal(BATCH, OBS), normal(BATCH, Z, seed=1)
+    mean, std = statistics().obs
+    out = perceptron(torch.cat([(obs - mean) / std, z], dim=1), policy.net)
+    found = torch.cat(policy(obs, z), dim=1)
+    wanted = torch.cat([out[:, :ACT], out[:, ACT:].clamp(-20, 0)], dim=1)
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6)
+
+
+def test_the_log_standard_deviation_is_clamped() -> None:
+    policy, z = actor(), normal(BATCH, Z)
+    last_bias = list(policy.parameters())[-1]
+    with torch.no_grad():
+        last_bias.copy_(torch.tensor([0.0, 0.0, 50.0, -50.0]))
+    _, log_std = policy(normal(BATCH, OBS), z)
+    assert (log_std[:, 0] == 0.0).all()
+    assert (log_std[:, 1] == -20.0).all()
+
+
+@pytest.mark.parametrize("heads", [1, 2, 3])
+def test_the_heads_of_a_critic_are_separate_networks(heads: int) -> None:
+    stats = statistics().obs
+    critic = Critic(stats, ACT + Z, HIDDEN, heads)
+    obs, action, z = (normal(BATCH, size, seed=size).float() for size in (OBS, ACT, Z))
+    found = critic(obs, action, z)
+    assert found.shape == (heads, BATCH)
+    start = torch.cat([(obs - stats[0]) / stats[1], action, z], dim=1)
+    for head in range(heads):
+        x = start
+        for layer in range(3):
+            weight, bias = critic.weights[layer][head], critic.biases[layer][head, 0]
+            x = functional.linear(x, weight.T, bias)
+            x = functional.relu(x) if layer < 2 else x
+        torch.testing.assert_close(found[head], x[:, 0], rtol=1e-4, atol=1e-5)
+    assert len(found[:, 0].unique()) == heads
+
+
+def test_a_critic_starts_like_torchs_layers() -> None:
+    critic = Critic(statistics().obs, ACT + Z, (101, 103), heads=2)
+    for weight, fan_in in zip(critic.weights, (OBS + ACT + Z, 101, 103), strict=True):
+        bound = fan_in**-0.5
+        assert 0.8 * bound < weight.abs().max() <= bound
+        assert weight.shape[:2] == (2, fan_in)
+
+
+def test_predictors_predict_standardised_rewards_and_changes() -> None:
+    stats = statistics()
+    predictors = Predictors(stats, ACT, Z, HIDDEN)
+    obs, action = contexts()[0][..., :OBS], contexts()[0][..., OBS : OBS + ACT]
+    z = normal(BATCH, 1, Z).float().expand(BATCH, LENGTH, Z)
+    reward, change = predictors(obs, action, z)
+    assert reward.shape == (BATCH, LENGTH, 1)
+    assert change.shape == (BATCH, LENGTH, OBS)
+    x = torch.cat([(obs - stats.obs[0]) / stats.obs[1], action, z], dim=-1)
+    torch.testing.assert_close(reward, perceptron(x, predictors.reward_net))
+    torch.testing.assert_close(change, perceptron(x, predictors.state_net))
+
+
+def test_the_predictors_targets() -> None:
+    stats = statistics()
+    obs, _, reward, next_obs = torch.split(contexts()[0], [OBS, ACT, 1, OBS], dim=-1)
+    found = Predictors(stats, ACT, Z, HIDDEN).targets(reward, obs, next_obs)
+    mean, std = stats.target
+    torch.testing.assert_close(found[0], (reward - mean[0]) / std[0])
+    torch.testing.assert_close(found[1], (next_obs - obs - mean[1:]) / std[1:])
