@@ -1,6 +1,7 @@
-"""Environment steps a second: the native vector environments beside Gymnasium's SyncVectorEnv.
+r"""Environment steps a second: the native vector environments beside Gymnasium's SyncVectorEnv.
 
-    python benchmarks/env_steps.py --out benchmarks/results/env_steps.csv
+    python benchmarks/env_steps.py --repetitions 11 --seconds 0.15 \
+        --out benchmarks/results/env_steps.csv
 
 Both step the same environment with the same actions, in one thread of one process, by turns, resets
 included. A ratio is taken within one turn, so that a busy machine slows both sides of it.

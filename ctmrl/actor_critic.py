@@ -129,6 +129,7 @@ class ActorCritic(nn.Module):
             coefficient = self.multiplier.coefficient()
             actor = actor + self.entropy_coef * coefficient * divergence.mean()
             self.multiplier.update(divergence)
+            metrics["loss/actor"] = actor.detach()
             metrics["divergence/mean"] = divergence.detach().mean()
             metrics["divergence/coefficient"] = coefficient
         return critic + value + actor, metrics

@@ -20,7 +20,7 @@ Preset = Literal["standard", "paper", "smoke"]
 class MetaTrainConfig:
     """Hyper-parameters of meta-training that no method changes."""
 
-    steps: int = 8_000
+    steps: int = 6_000
     """Gradient steps."""
     meta_batch: int = 16
     """B, training tasks in a batch, all different (fewer if there are fewer)."""

@@ -12,6 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import StrMethodFormatter
 from numpy.typing import NDArray
 
 from datagen.dataset import Dataset, TaskData
@@ -25,7 +26,7 @@ SHOWN_TASKS = 6
 """Tasks whose episodes are drawn."""
 EPISODES_A_CHECKPOINT = 2
 """Episodes of each checkpoint that are drawn of a task."""
-TRAIN, TEST, RANDOM, EXPERT = "#1f5fa8", "#c8601a", "#777777", "#1a7f37"
+TRAIN, TEST = "#1f5fa8", "#c8601a"
 
 
 def draw(dataset: Dataset, path: Path) -> None:
@@ -49,12 +50,16 @@ def draw(dataset: Dataset, path: Path) -> None:
         f"{dataset.index['env_id']}, {len(dataset.tasks)} tasks, budget {dataset.index['budget']}"
     )
     _draw_returns(left.subplots(), dataset.index["tasks"])
-    if definition(dataset.env).observation_space.shape == (2,):
+    if _in_the_plane(dataset.env):
         _draw_paths(right, [dataset.read(task) for task in _spread(dataset.tasks.tolist())])
     else:
         _draw_histogram(right.subplots(), [dataset.read(int(task)) for task in dataset.tasks])
     # No date and no version, so that the same dataset gives the same picture.
     figure.savefig(path, dpi=130, metadata=_without_date(path))
+
+
+def _in_the_plane(env: str) -> bool:
+    return definition(env).observation_space.shape == (2,)
 
 
 def _without_date(path: Path) -> dict[str, None]:
@@ -80,9 +85,11 @@ def _draw_returns(axes: Axes, records: Sequence[Mapping[str, Any]]) -> None:
         axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
         label = f"{len(group)} {split} tasks, mean and 10-90 %"
         axes.plot(x, values.mean(axis=0), "o-", color=colour, markersize=4, label=label)
-    for name, colour in (("expert", EXPERT), ("random", RANDOM)):
-        level = float(np.mean([one["returns"][name] for one in records]))
-        axes.axhline(level, color=colour, linestyle="--", label=f"{name}, {level:.2f}")
+        for name, style in (("expert", "--"), ("random", ":")):
+            level = float(np.mean([one[name] for one in group]))
+            label = f"{name} on {split} tasks, {level:.2f}"
+            axes.axhline(level, color=colour, linestyle=style, label=label)
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_xlabel("checkpoint: training steps of the behaviour policy")
     axes.set_ylabel("return of its stochastic episodes")
     axes.grid(alpha=0.25)
@@ -116,7 +123,7 @@ def _draw_paths(figure: SubFigure, tasks: Sequence[TaskData]) -> None:
         ScalarMappable(scale, "viridis"), ax=grid, label="return of the episode", extend="min"
     )
     names = ", ".join(tasks[0].meta["param_names"])
-    figure.suptitle(f"Episodes of {len(tasks)} tasks (title: {names})", fontsize="medium")
+    figure.suptitle(f"Episodes of {len(tasks)} tasks, by {names}", fontsize="medium")
 
 
 def _shown_episodes(data: TaskData) -> NDArray[np.int64]:

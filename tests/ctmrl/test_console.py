@@ -1,0 +1,112 @@
+"""What commands show: exit codes, sentences, progress."""
+
+from __future__ import annotations
+
+import errno
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from ctmrl.console import TrainingDisplay, run_command
+from ctmrl.errors import UsageError
+from datagen.dataset import DatasetError
+
+ROW: dict[str, float | None] = {
+    "step": 30,
+    "loss/encoder/contrast": 0.125,
+    "loss/actor": 1234.5,
+    "codes/perplexity": 2.5,
+    "policy/q": -7.0,
+    "return/training_tasks": -12.345,
+}
+
+
+def failing(error: BaseException) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (UsageError("no method 'x'"), 2, "error: no method 'x'\n"),
+        (DatasetError(Path("d"), "is gone", "get it"), 2, "error: d: is gone; get it\n"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "runs/x"),
+            2,
+            "error: [Errno 28] No space left on device: 'runs/x'\n",
+        ),
+        (KeyboardInterrupt(), 130, "Stopped. The same command goes on from the last checkpoint.\n"),
+    ],
+)
+def test_what_ends_a_command(
+    error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(lambda: failing(error)) == code
+    assert capsys.readouterr() == ("", said)
+
+
+def test_a_command_that_ends_well(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(lambda: None) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_fault_of_ours_is_not_hidden() -> None:
+    with pytest.raises(ZeroDivisionError):
+        run_command(lambda: failing(ZeroDivisionError()))
+
+
+def shown(rows: list[dict[str, float | None]], terminal: bool, n_codes: int | None = 3) -> str:
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=terminal, width=150)
+    with TrainingDisplay(console, 60, 0, n_codes) as display:
+        for row in rows:
+            display.show(row)
+    return file.getvalue()
+
+
+def test_lines_where_there_is_no_terminal() -> None:
+    (line,) = shown([ROW], terminal=False).splitlines()
+    assert line.startswith("step 30/60: contrast 0.125, actor 1.23e+03; codes in use 2.5 of 3; ")
+    assert "return on training tasks -12.35; " in line
+    assert line.endswith(" s left")
+
+
+def test_a_line_for_measured_returns_only() -> None:
+    rows = [{**ROW, "step": step, "return/training_tasks": None} for step in (10, 20)]
+    assert shown(rows, terminal=False) == ""
+    assert len(shown([*rows, ROW], terminal=False).splitlines()) == 1
+
+
+def test_a_return_of_0_is_a_return() -> None:
+    # The sparse robot's, as long as it has not found the goal.
+    first = shown([{**ROW, "return/training_tasks": 0.0}], terminal=False)
+    assert "return on training tasks 0.00; " in first
+    later = shown([ROW, {**ROW, "return/training_tasks": 0.0}], terminal=False)
+    assert "return on training tasks 0.00; " in later.splitlines()[1]
+
+
+def test_a_method_without_codes() -> None:
+    row = {key: value for key, value in ROW.items() if key != "codes/perplexity"}
+    (line,) = shown([row], terminal=False, n_codes=None).splitlines()
+    assert "codes" not in line
+
+
+def test_the_live_table() -> None:
+    text = shown([ROW, {**ROW, "step": 40, "return/training_tasks": None}], terminal=True)
+    assert "meta-training" in text
+    assert "steps/s" in text
+    for key, value in ROW.items():
+        assert key == "step" or f"{key} " in text
+        assert key == "step" or f"{value:.4f}" in text
+    # The last measured return stays in sight.
+    assert text.rindex("-12.3450") > text.index("67%")
+
+
+def test_the_live_table_ends_with_an_error() -> None:
+    console = Console(file=io.StringIO(), force_terminal=True)
+    with pytest.raises(UsageError), TrainingDisplay(console, 60, 0, 3):
+        raise UsageError("diverged")
+    with TrainingDisplay(console, 60, 0, 3):
+        pass

@@ -1,0 +1,194 @@
+"""The training tasks' table: which rows batches and contexts are drawn from."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ctmrl.data import OfflineData
+from ctmrl.errors import UsageError
+from datagen.dataset import DatasetError, open_dataset, task_file
+from tests.ctmrl.examples import ACT, OBS, generator, open_hand_made
+
+LENGTHS = {7: (3, 11, 2, 5, 13), 2: (17,) * 7, 5: (1, 2, 3, 1, 2, 3)}
+"""Episodes of three tasks, in the order of the table: the learner's tasks 0, 1 and 2."""
+TASK_OF = list(LENGTHS)
+
+
+@pytest.fixture(scope="module")
+def data() -> OfflineData:
+    return open_hand_made(LENGTHS)
+
+
+def wanted_reward(obs: Tensor) -> Tensor:
+    """The reward of rows (task, episode, step)."""
+    return 1000 * obs[..., 0] + 10 * obs[..., 1] + obs[..., 2] / 10
+
+
+def test_the_table_counts_tasks_and_episodes(data: OfflineData) -> None:
+    assert len(data) == 3
+    assert data.tasks.tolist() == [7, 2, 5]
+    assert data.episodes == 5
+    assert (data.obs_dim, data.act_dim) == (OBS, ACT)
+    assert data.table.dtype == torch.float32
+    assert len(data.table) == 34 + 7 * 17 + 12
+
+
+def test_a_batch_is_of_the_right_tasks_in_order(data: OfflineData) -> None:
+    tasks, n = torch.tensor([2, 0]), 13
+    found = data.transitions(tasks, n, generator())
+    assert [tuple(part.shape) for part in found] == [(26, OBS), (26, ACT), (26,), (26, OBS), (26,)]
+    assert found.obs[:, 0].tolist() == [5.0] * n + [7.0] * n
+    # The actor-critic learns from the dense reward, which is minus the other one here.
+    torch.testing.assert_close(found.reward, -wanted_reward(found.obs))
+    reward = -found.reward
+    torch.testing.assert_close(found.action, torch.stack([reward.sin(), reward.cos()], dim=1))
+    moved = found.obs + torch.tensor([0.0, 0.0, 1.0])
+    assert found.next_obs.equal(moved)
+
+
+def test_batches_are_uniform_over_a_tasks_rows_with_replacement(data: OfflineData) -> None:
+    found = data.transitions(torch.tensor([0]), 34_000, generator())
+    rows, counts = np.unique(found.obs.numpy(), axis=0, return_counts=True)
+    assert len(rows) == 34
+    # Binomial: mean 1000, deviation 31.
+    assert np.abs(counts - 1000).max() < 140
+
+
+@pytest.mark.parametrize("timeouts_as_terminals", [False, True])
+def test_terminals_are_real_ends_unless_asked_otherwise(timeouts_as_terminals: bool) -> None:
+    table = open_hand_made(LENGTHS, timeouts_as_terminals)
+    found = table.transitions(torch.tensor([0, 1, 2]), 5_003, generator())
+    task, episode, step = found.obs.long().unbind(dim=1)
+    for k in range(len(task)):
+        length = LENGTHS[int(task[k])][int(episode[k])]
+        last = bool(step[k] == length - 1)
+        odd = bool(episode[k] % 2 == 1)
+        assert bool(found.terminal[k]) == (last and (odd or timeouts_as_terminals))
+
+
+def test_contexts_have_the_rows_of_their_episodes_and_tasks(data: OfflineData) -> None:
+    tasks, sets, episodes, n = torch.tensor([1, 2, 0]), 2, 2, 1_009
+    found = data.contexts(tasks, sets, episodes, n, generator())
+    assert found.shape == (sets, 3, n, 2 * OBS + ACT + 1)
+    obs, action, reward, next_obs = torch.split(found, [OBS, ACT, 1, OBS], dim=-1)
+    # Contexts see the environment's own reward, not the dense one.
+    torch.testing.assert_close(reward[..., 0], wanted_reward(obs))
+    torch.testing.assert_close(action, torch.cat([reward.sin(), reward.cos()], dim=-1))
+    assert next_obs.equal(obs + torch.tensor([0.0, 0.0, 1.0]))
+    for k, i in itertools.product(range(sets), range(3)):
+        task = TASK_OF[int(tasks[i])]
+        assert (obs[k, i, :, 0] == task).all()
+        chosen = sorted({int(e) for e in obs[k, i, :, 1]})
+        assert len(chosen) == episodes
+        rows = {(int(e), int(t)) for _, e, t in obs[k, i].tolist()}
+        assert rows == {(e, t) for e in chosen for t in range(LENGTHS[task][e])}
+
+
+def test_no_episode_is_in_two_of_a_tasks_sets(data: OfflineData) -> None:
+    draw, seen = generator(), set()
+    for _ in range(60):
+        found = data.contexts(torch.arange(3), 2, 2, 211, draw)
+        for i in range(3):
+            first, second = ({*found[k, i, :, 1].long().tolist()} for k in range(2))
+            assert len(first) == len(second) == 2
+            assert not first & second
+            seen |= {(i, episode) for episode in first | second}
+    # And every episode has its turn.
+    assert seen == {(i, e) for i, t in enumerate(TASK_OF) for e in range(len(LENGTHS[t]))}
+
+
+def test_all_episodes_of_the_smallest_task_can_be_used(data: OfflineData) -> None:
+    found = data.contexts(torch.tensor([0]), 5, 1, 101, generator())
+    assert sorted(found[:, 0, 0, 1].tolist()) == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
+def test_contexts_are_uniform_over_the_rows_of_their_episodes(data: OfflineData) -> None:
+    # Episodes of 3, 11, 2, 5 and 13 steps: a step counts, not an episode.
+    found = data.contexts(torch.tensor([0]), 1, 5, 34_000, generator())
+    _, counts = np.unique(found[0, 0, :, :OBS].numpy(), axis=0, return_counts=True)
+    assert len(counts) == 34
+    assert np.abs(counts - 1000).max() < 140
+
+
+def test_episodes_are_chosen_uniformly(data: OfflineData) -> None:
+    draw, counts = generator(), torch.zeros(5)
+    for _ in range(500):
+        found = data.contexts(torch.tensor([0]), 1, 1, 2, draw)
+        counts[int(found[0, 0, 0, 1])] += 1
+    assert (counts - 100).abs().max() < 45
+
+
+def test_draws_depend_on_the_generator_alone(data: OfflineData) -> None:
+    tasks = torch.tensor([1, 0])
+    first, again, other = (data.contexts(tasks, 2, 2, 7, generator(seed)) for seed in (3, 3, 4))
+    assert first.equal(again)
+    assert not first.equal(other)
+    one, same = (data.transitions(tasks, 7, generator(3)).obs for _ in range(2))
+    assert one.equal(same)
+
+
+@pytest.mark.parametrize(("sets", "episodes"), [(2, 3), (1, 6), (6, 1)])
+def test_too_few_episodes_are_one_sentence(data: OfflineData, sets: int, episodes: int) -> None:
+    with pytest.raises(UsageError, match=f"{sets} x {episodes} .*the dataset has 5: collect more"):
+        data.contexts(torch.tensor([1]), sets, episodes, 7, generator())
+    with pytest.raises(UsageError):
+        data.check_episodes(sets, episodes)
+
+
+@pytest.mark.parametrize("next_obs", [True, False])
+def test_statistics_against_numpy(wind_path: Path, next_obs: bool) -> None:
+    dataset = open_dataset(wind_path)
+    columns = [dataset.read(int(task)).columns for task in dataset.train_tasks]
+    obs, action, reward, after = (
+        np.concatenate([part[name] for part in columns]).astype(np.float64)
+        for name in ("observations", "actions", "rewards", "next_observations")
+    )
+    change = after - obs
+    seen = [obs, action, reward[:, None]] + [change] * next_obs
+    wanted = obs, np.hstack(seen), np.hstack([reward[:, None], change])
+    found = OfflineData(dataset, dataset.train_tasks).statistics(next_obs)
+    for (mean, std), values in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(mean, values.mean(axis=0), atol=1e-5)
+        np.testing.assert_allclose(std, values.std(axis=0, ddof=1), rtol=1e-4)
+
+
+def test_contexts_see_sparse_rewards_and_batches_dense_ones(sparse_path: Path) -> None:
+    dataset = open_dataset(sparse_path)
+    data = OfflineData(dataset, dataset.train_tasks)
+    tasks = torch.arange(len(data))
+    for i, task in enumerate(dataset.train_tasks):
+        goal = dataset.params[dataset.tasks == task][0]
+        dense = data.transitions(tasks[i : i + 1], 300, generator())
+        distance = np.linalg.norm(dense.next_obs.numpy() - goal, axis=1)
+        np.testing.assert_allclose(dense.reward, -distance, atol=1e-5)
+        context = data.contexts(tasks[i : i + 1], 1, 4, 300, generator())[0, 0]
+        distance = np.linalg.norm(context[:, -2:].numpy() - goal, axis=1)
+        np.testing.assert_allclose(context[:, 4], np.maximum(1 - distance / 0.2, 0), atol=1e-5)
+
+
+def test_the_test_tasks_files_are_never_read(wind_path: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(wind_path, tmp_path / "wind")
+    dataset = open_dataset(folder)
+    assert dataset.test_tasks.tolist() == [2, 7]
+    (folder / task_file(2)).unlink()
+    (folder / task_file(7)).write_bytes(b"not a dataset")
+    data = OfflineData(dataset, dataset.train_tasks)
+    assert data.tasks.tolist() == [0, 1, 3, 4, 5, 6, 8]
+    with pytest.raises(DatasetError):
+        OfflineData(dataset, dataset.tasks)
+
+
+def test_a_damaged_training_file_is_an_error(wind_path: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(wind_path, tmp_path / "wind")
+    dataset = open_dataset(folder)
+    path = folder / task_file(4)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(DatasetError, match="task_004"):
+        OfflineData(dataset, dataset.train_tasks)

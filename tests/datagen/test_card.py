@@ -1,0 +1,108 @@
+"""The card: from the index alone, true, and with a command that makes the dataset again."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen.budgets import budget
+from datagen.card import card, mean_returns, named_checkpoints, remake_command, rows_text
+from datagen.job import origin
+from tests.datagen.examples import index_of, write_dataset
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The index of four tasks, of which task 2 is a test task."""
+    env, tasks = "point_robot_wind", (0, 1, 2, 3)
+    folder = write_dataset(tmp_path_factory.mktemp("card"), tasks, env)
+    made = origin(env, budget(env, "smoke"), 0)
+    return {**made, "tasks": index_of(folder, env, tasks, 4, 0)["tasks"]}
+
+
+def test_the_same_index_gives_the_same_card(index: dict[str, Any]) -> None:
+    again = json.loads(json.dumps(index, sort_keys=True))
+    assert card(index) == card(again)
+    assert card({**index, "sha256": "0" * 64}) == card(index)
+
+
+def test_front_matter_lists_every_file_in_its_split(index: dict[str, Any]) -> None:
+    _, front, rest = card(index).split("---\n", 2)
+    assert "license: mit\n" in front
+    assert "- reinforcement-learning\n" in front
+    assert "- n<1K\n" in front
+    assert rest.startswith("\n# PointRobotWind-v0")
+    train, test = front.split("  - split: test\n")
+    assert re.findall(r"task_\d+\.h5", train) == ["task_000.h5", "task_001.h5", "task_003.h5"]
+    assert re.findall(r"task_\d+\.h5", test) == ["task_002.h5"]
+
+
+def test_numbers_of_the_table_are_those_of_the_index(index: dict[str, Any]) -> None:
+    text = card(index)
+    train = [record for record in index["tasks"] if record["split"] == "train"]
+    assert len(train) == 3
+    size = sum(record["bytes"] for record in train)
+    assert f"| bytes | {size:,} | {index['tasks'][2]['bytes']:,} |" in text
+    assert "| transitions | 300 | 100 |" in text
+    random = sum(record["returns"]["random"] for record in train) / 3
+    of_test = index["tasks"][2]["returns"]["random"]
+    assert f"| return: random policy | {random:.2f} | {of_test:.2f} |" in text
+    assert "| return: expert | -5.00 | -5.00 |" in text
+    assert "middle checkpoint" not in text, "there are only two"
+    assert "| `observations` | float32 | N x 2 |" in text
+    assert "dense_rewards" not in text
+    assert "| `gamma` | 0.9 |" in text
+
+
+def test_a_card_without_test_tasks(index: dict[str, Any]) -> None:
+    text = card({**index, "tasks": index["tasks"][:2]})
+    assert "split: test" not in text
+    assert "|  | train tasks |\n" in text
+
+
+@pytest.mark.parametrize(
+    ("tasks", "text"), [([0, 1, 2, 5], "0-2,5"), ([4], "4"), ([], ""), ([1, 3, 4], "1,3-4")]
+)
+def test_rows_text(tasks: list[int], text: str) -> None:
+    assert rows_text(tasks) == text
+
+
+def test_the_command_has_what_differs_from_the_defaults(index: dict[str, Any]) -> None:
+    start = "python -m datagen.collect --env point_robot_wind --budget smoke"
+    assert remake_command(index) == f"{start} --tasks 0-3 --seed 0"
+    every = [{"task": task} for task in range(50)]
+    assert remake_command({**index, "tasks": every, "seed": 4}) == f"{start} --seed 4"
+    thin = {**index, "tasks": every, "config": {**index["config"], "episodes": 12}}
+    assert remake_command(thin) == f"{start} --episodes 12 --seed 0"
+
+
+def record(behavior: dict[str, float], **more: float) -> dict[str, Any]:
+    deterministic = {mark: value + 1 for mark, value in behavior.items()}
+    returns = {"random": -30.0, "expert": -5.0, **more}
+    return {"returns": {**returns, "behavior": behavior, "deterministic": deterministic}}
+
+
+def test_mean_returns() -> None:
+    one = record({"1000": -9.0, "200": -20.0, "400": -8.0})
+    two = record({"1000": -6.0, "200": -10.0, "400": -10.0}, expert=-4.0)
+    assert mean_returns([one, two]) == {
+        "random": -30.0, "first": -15.0, "middle": -9.0, "last": -7.5,
+        "best": -7.0, "best deterministic": -6.0, "expert": -4.5,
+    }  # fmt: skip
+
+
+def test_checkpoints_are_ordered_as_numbers() -> None:
+    assert named_checkpoints(record({"1000": 0, "200": 0, "400": 0})) == {
+        "first": "200", "middle": "400", "last": "1000",
+    }  # fmt: skip
+    assert named_checkpoints(record({"1000": 0, "200": 0})) == {"first": "200", "last": "1000"}
+    assert named_checkpoints(record({"200": 0})) == {"last": "200"}
+
+
+def test_nothing_of_this_machine_is_in_it(index: dict[str, Any], tmp_path: Path) -> None:
+    assert str(tmp_path.parent) not in card(index)
+    assert not re.search(r"\b20\d\d-\d\d-\d\d\b|\d\d:\d\d", card(index))

@@ -1,0 +1,37 @@
+"""The dry run's estimate: measured, and in proportion to the plan."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+import pytest
+
+from datagen import estimate
+from datagen.budgets import budget
+from datagen.estimate import START_SECONDS, seconds_a_learning_step, seconds_a_rollout, seconds_of
+from datagen.plan import Plan
+
+
+def test_a_learning_step_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate, "MEASURED_SECONDS", 0.2)
+    begin = time.perf_counter()
+    found = seconds_a_learning_step("point_robot", budget("point_robot", "smoke"))
+    # It ran at least 100 learning steps, and a step of it takes longer than a microsecond.
+    assert 1e-6 < found < (time.perf_counter() - begin) / 100
+
+
+def test_a_rollout_is_measured() -> None:
+    assert 0 < seconds_a_rollout("point_robot", 2) < seconds_a_rollout("point_robot", 20_000)
+
+
+def test_the_estimate_is_in_proportion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(estimate, "seconds_a_learning_step", lambda env, budget: 0.01)
+    monkeypatch.setattr(estimate, "seconds_a_rollout", lambda env, episodes: 0.5)
+    paper = budget("point_robot", "paper")
+    plan = Plan("point_robot", tuple(range(5)), paper, 0, tmp_path, workers=2)
+    task = 2800 * 0.01 + 14 * 0.5
+    assert seconds_of(plan) == pytest.approx(START_SECONDS + 3 * task)
+    alone = dataclasses.replace(plan, workers=1)
+    assert seconds_of(alone) == pytest.approx(START_SECONDS + 5 * task)

@@ -1,0 +1,132 @@
+"""What is finished in a folder: verified, of one origin, and summed up in an index."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from datagen import finished
+from datagen.budgets import budget
+from datagen.dataset import DatasetError, TaskData, open_dataset, task_file, write_task
+from datagen.finished import remove_stale, scan, without_versions, write_summary
+from datagen.job import origin
+from tests.datagen.examples import task_data
+
+ENV = "point_robot_wind"
+ORIGIN = origin(ENV, budget(ENV, "smoke"), 0)
+
+
+def put(folder: Path, task: int, **changes: Any) -> Path:
+    """Write a task's file that says it was collected with the smoke budget, but for `changes`."""
+    made = task_data(task)
+    path = folder / task_file(task)
+    write_task(path, TaskData(task, made.columns, {**made.meta, **ORIGIN, **changes}))
+    return path
+
+
+def test_a_folder_that_is_not_there_is_empty(tmp_path: Path) -> None:
+    assert scan(tmp_path / "none", ORIGIN) == {}
+    remove_stale(tmp_path / "none")
+
+
+def test_finished_tasks_are_found_in_order(tmp_path: Path) -> None:
+    for task in (11, 2, 5):
+        put(tmp_path, task)
+    (tmp_path / "task_7.h5").write_text("not a task file's name")
+    found = scan(tmp_path, ORIGIN)
+    assert list(found) == [2, 5, 11]
+    assert found[2].record["split"] == "test"
+    assert found[2].record["transitions"] == 100
+    assert found[2].record["bytes"] == (tmp_path / "task_002.h5").stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"seed": 3}, "was collected with seed 3, not 0; "),
+        ({"budget": "paper"}, "was collected with budget 'paper', not 'smoke'; "),
+        (
+            {"config": {**ORIGIN["config"], "sac": {**ORIGIN["config"]["sac"], "gamma": 0.5}}},
+            r"was collected with config\.sac\.gamma 0\.5, not 0\.9; ",
+        ),
+        (
+            {"config": {**ORIGIN["config"], "beta": 1}},
+            r"was collected with config\.beta 1, not nothing of that name; ",
+        ),
+        (
+            {"versions": {**ORIGIN["versions"], "torch": "1.0"}},
+            r"was collected with versions\.torch '1\.0', not '",
+        ),
+    ],
+)
+def test_a_difference_is_named(tmp_path: Path, changes: dict[str, Any], sentence: str) -> None:
+    put(tmp_path, 1, **changes)
+    with pytest.raises(DatasetError, match=sentence + ".*choose another --out, or delete"):
+        scan(tmp_path, ORIGIN)
+
+
+def test_versions_are_compared_among_the_files_where_none_are_asked_for(tmp_path: Path) -> None:
+    for task in (1, 2):
+        put(tmp_path, task, versions={"torch": "1.0"})
+    assert list(scan(tmp_path, without_versions(ORIGIN))) == [1, 2]
+    put(tmp_path, 3, versions={"torch": "1.1"})
+    with pytest.raises(DatasetError, match=r"task_003\.h5: was .* versions\.torch '1\.1', not"):
+        scan(tmp_path, without_versions(ORIGIN))
+
+
+def test_a_damaged_file_is_an_error(tmp_path: Path) -> None:
+    path = put(tmp_path, 1)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DatasetError, match=r"task_001\.h5: is truncated .* delete it and run"):
+        scan(tmp_path, ORIGIN)
+
+
+def test_what_dead_writers_left_is_removed(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    stale = tmp_path / f".task_003.h5.{ended.pid}.partial"
+    living = tmp_path / f".task_004.h5.{os.getppid()}.partial"
+    other = tmp_path / ".hidden.partial"
+    for path in (stale, living, other):
+        path.write_text("half")
+    remove_stale(tmp_path)
+    assert [path.exists() for path in (stale, living, other)] == [False, True, True]
+
+
+def test_the_summary_is_a_dataset_with_a_card(tmp_path: Path) -> None:
+    for task in (3, 1, 2):
+        put(tmp_path, task)
+    index = write_summary(tmp_path, ORIGIN)
+    dataset = open_dataset(tmp_path)
+    assert dataset.tasks.tolist() == [1, 2, 3]
+    assert dataset.read(3).meta["task"] == 3
+    assert dataset.index["tasks"] == json.loads(json.dumps(index["tasks"]))
+    assert "on 3 of its 50 tasks" in (tmp_path / "README.md").read_text()
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    write_summary(tmp_path, ORIGIN)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_task_that_another_shard_finished_meanwhile_is_in_the_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(tmp_path, 1)
+    late = iter([2, 3])
+
+    def write_index_slowly(folder: Path, index: dict[str, Any]) -> None:
+        original(folder, index)
+        for task in late:
+            put(folder, task)
+            break
+
+    original = finished.write_index
+    monkeypatch.setattr(finished, "write_index", write_index_slowly)
+    write_summary(tmp_path, ORIGIN)
+    assert open_dataset(tmp_path).tasks.tolist() == [1, 2, 3]
+    assert "on 3 of its 50 tasks" in (tmp_path / "README.md").read_text()

@@ -1,0 +1,89 @@
+"""What a collection shows: the lines, the bars, the estimate."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from datagen.budgets import budget
+from datagen.progress import CollectionDisplay, TimeLeft, duration
+
+PAPER = budget("point_robot", "paper")
+RETURNS = {"random": -28.8, "expert": -5.1, "behavior": {"4800": -6.914}, "deterministic": {}}
+
+
+class Clock:
+    """A clock that stands still until it is moved."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_time_left_follows_the_updates() -> None:
+    clock = Clock()
+    left = TimeLeft(4, PAPER, clock)
+    clock.now += 1.0
+    left.step(0, 2000)
+    assert left.seconds() is None, "random steps say nothing about the time of updates"
+    clock.now += 9.0
+    left.step(0, 2000 + 1400)
+    # An eighth of all updates took ten seconds.
+    assert left.seconds() == pytest.approx(70.0)
+    clock.now += 10.0
+    left.done(0)
+    assert left.seconds() == pytest.approx(60.0)
+    for task in (1, 2, 3):
+        left.done(task)
+    assert left.seconds() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.2, "0 s"), (12, "12 s"), (89, "89 s"), (90, "2 min"), (5399, "90 min"), (9000, "2.5 h")],
+)
+def test_duration(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def collect_two_of_three(console: Console) -> CollectionDisplay:
+    with CollectionDisplay(console, 3, 2, PAPER) as display:
+        for task in (3, 8):
+            display.started(task)
+            for step in (1000, 3000, 4800):
+                display.step(task, step)
+            display.done(task, RETURNS)
+    return display
+
+
+def test_a_line_a_task_off_the_terminal() -> None:
+    out = io.StringIO()
+    display = collect_two_of_three(Console(file=out, width=40))
+    first, last = out.getvalue().splitlines()
+    numbers = r"behaviour -6\.91, random -28\.80, expert -5\.10; 0 s"
+    assert re.fullmatch(rf"task 3 \(2/3\): {numbers}, about 0 s left", first)
+    assert re.fullmatch(rf"task 8 \(3/3\): {numbers}", last)
+    assert display.finished == 3
+
+
+def test_bars_on_a_terminal() -> None:
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=100, color_system=None)
+    with CollectionDisplay(console, 3, 2, PAPER) as display:
+        display.started(3)
+        display.step(3, 1000)
+        display.started(8)
+        display.step(8, 4800)
+        assert display._progress is not None
+        display._progress.refresh()
+        shown = out.getvalue()
+        display.done(8, RETURNS)
+        display._progress.refresh()
+    assert re.search(r"tasks +\S+ +1/3 +about 0 s left", shown)
+    assert re.search(r"task 3 +\S+ +1000/4800 +random steps", shown)
+    assert re.search(r"task 8 +\S+ +4800/4800 +rolling out", shown)
+    assert "task 8 (2/3): behaviour -6.91" in out.getvalue()
