@@ -192,3 +192,43 @@ def write_good_dataset(folder: Path, tasks: Sequence[int], episodes: int, seed: 
         record |= {"episodes": episodes, "transitions": episodes * 25}
     write_index(folder, index)
     return folder
+
+
+def record(
+    method: str = "ctmrl", seed: int = 0, groups: Sequence[str] = ("seen", "unseen")
+) -> dict[str, Any]:
+    """An evaluation's record on five tasks a group, with round numbers."""
+    draw = np.random.default_rng([seed, len(method)])
+    return {
+        "env": "point_robot_wind",
+        "method": method,
+        "seed": seed,
+        "evaluation_seed": seed,
+        "protocol": {
+            "random_episodes": 2,
+            "policy_episodes": 1,
+            "scored_episodes": 1,
+            "repetitions": 3,
+        },
+        "param_names": ["wind_x", "wind_y"],
+        "groups": {
+            name: {
+                "tasks": [10 * number + k for k in range(5)],
+                "params": draw.uniform(-0.05, 0.05, (5, 2)).tolist(),
+                "return": -8.0 - seed - number,
+                "score": 100.0 * (22.0 - seed - number) / 25.0,
+                "task_returns": [-8.0 - seed - number] * 5,
+                "repetition_returns": [-8.0 - seed - number] * 3,
+                "curve": draw.uniform(-12.0, -8.0, (4, 5)).tolist(),
+                "references": {
+                    "random": -30.0,
+                    "oracle": -5.0,
+                    "wind_blind": -6.0,
+                    "best_behavior": -5.5,
+                },
+                "contexts": draw.normal(size=(5, Z)).tolist(),
+                "codes": draw.integers(0, 3, 5).tolist() if method == "ctmrl" else None,
+            }
+            for number, name in enumerate(groups)
+        },
+    }

@@ -112,5 +112,5 @@ def test_an_unknown_preset_or_environment_is_one_sentence() -> None:
     ],
 )
 def test_a_file_of_another_version_is_one_sentence(stored: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match="^run/config.json does not fit this version of ctmrl"):
+    with pytest.raises(UsageError, match=r"^run/config\.json does not fit this version of ctmrl"):
         config_from_settings(stored, PATH)

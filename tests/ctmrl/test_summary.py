@@ -1,7 +1,10 @@
+"""Results over seeds."""
+
 from __future__ import annotations
 
+import csv
 import json
-from itertools import product
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,79 +13,109 @@ import pytest
 
 from ctmrl.errors import UsageError
 from ctmrl.summary import collate, find_records, interquartile_mean, interval, to_csv
+from tests.ctmrl.examples import record
 
 
-def record(seed: int, value: float, tasks: tuple[int, ...] = (2, 7)) -> dict[str, Any]:
-    group = {
-        "tasks": list(tasks),
-        "return": value,
-        "score": 100 + value,
-        "references": {"random": -30.0, "oracle": -5.0},
-    }
-    return {"env": "point_robot", "method": "focal", "seed": seed, "groups": {"unseen": group}}
+def of_run(name: str = "", **changes: Any) -> dict[str, Any]:
+    made = record(**changes)
+    return {**made, "run": name or f"runs/{made['method']}/seed-{made['seed']}"}
 
 
-def write(folder: Path, content: dict[str, Any]) -> Path:
+def write(folder: Path, content: object) -> Path:
     folder.mkdir(parents=True)
     (folder / "evaluation.json").write_text(json.dumps(content))
     return folder
 
 
-def test_seeds_are_collated_in_their_order(tmp_path: Path) -> None:
-    for seed, value in ((10, -7.0), (2, -5.0), (0, -6.0)):
-        write(tmp_path / f"seed-{seed}", record(seed, value))
-    (result,) = collate(find_records([tmp_path]))
-    assert result.seeds == (0, 2, 10)
-    assert result.returns.tolist() == [-6.0, -5.0, -7.0]
-    assert result.scores.tolist() == [94.0, 95.0, 93.0]
-    assert result.references["oracle"] == -5.0
-    assert to_csv([result]).splitlines()[2] == "point_robot,focal,unseen,2,-5.0000,95.00"
+def test_records_are_found_in_folders_and_below(tmp_path: Path) -> None:
+    for seed in (2, 0, 1):
+        write(tmp_path / "runs" / f"seed-{seed}", record(seed=seed))
+    found = find_records([tmp_path / "runs"])
+    assert [one["seed"] for one in found] == [0, 1, 2]
+    assert found[2]["run"] == str(tmp_path / "runs" / "seed-2")
+    # A run that is named twice counts once.
+    twice = [tmp_path / "runs" / "seed-1", tmp_path / "runs"]
+    assert len(find_records(twice)) == 3
+    assert len(find_records(twice[:1])) == 1
 
 
-def test_a_folder_named_twice_counts_once(tmp_path: Path) -> None:
-    one = write(tmp_path / "seed-0", record(0, -6.0))
-    assert len(find_records([tmp_path, one])) == 1
+def test_no_record_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no finished run in .*a, .*b: "):
+        find_records([tmp_path / "a", tmp_path / "b"])
 
 
-def test_two_runs_of_one_seed_are_refused(tmp_path: Path) -> None:
-    write(tmp_path / "a", record(3, -6.0))
-    write(tmp_path / "b", record(3, -5.0))
-    with pytest.raises(UsageError, match="both have seed 3"):
-        collate(find_records([tmp_path]))
-
-
-def test_runs_on_different_tasks_are_refused(tmp_path: Path) -> None:
-    write(tmp_path / "a", record(0, -6.0))
-    write(tmp_path / "b", record(1, -5.0, tasks=(2, 8)))
-    with pytest.raises(UsageError, match="different unseen tasks"):
-        collate(find_records([tmp_path]))
-
-
-@pytest.mark.parametrize("content", ["", "[]", '{"env": 1}'])
-def test_a_foreign_evaluation_is_named(tmp_path: Path, content: str) -> None:
-    (tmp_path / "evaluation.json").write_text(content)
+@pytest.mark.parametrize("content", [[], 3, {}, {"groups": {}, "env": "x", "method": "y"}])
+def test_a_foreign_record_is_one_sentence(content: object, tmp_path: Path) -> None:
+    folder = write(tmp_path / "x", content)
+    with pytest.raises(UsageError, match=r"evaluation.json is not an evaluation of a run"):
+        find_records([folder])
+    (folder / "evaluation.json").write_text('{"groups": ')
     with pytest.raises(UsageError, match="is not an evaluation of a run"):
-        find_records([tmp_path])
+        find_records([folder])
 
 
-def test_no_run_is_said(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no finished run"):
-        find_records([tmp_path])
+def test_records_are_collated_by_environment_method_and_group() -> None:
+    records = [of_run(seed=3), of_run(seed=1), of_run(method="focal", seed=1), of_run(seed=10)]
+    results = collate(records)
+    assert [(result.method, result.group) for result in results] == [
+        ("ctmrl", "seen"),
+        ("ctmrl", "unseen"),
+        ("focal", "seen"),
+        ("focal", "unseen"),
+    ]
+    unseen = results[1]
+    assert unseen.env == "point_robot_wind"
+    assert unseen.seeds == (1, 3, 10)
+    np.testing.assert_allclose(unseen.returns, [-10.0, -12.0, -19.0])
+    np.testing.assert_allclose(unseen.scores, [80.0, 72.0, 44.0])
+    assert unseen.references["oracle"] == -5.0
 
 
-def test_the_interval_is_that_of_all_resamples() -> None:
-    values = np.array([-5.1, -5.9, -5.4])
-    # With three seeds there are only 27 resamples: the exact percentiles can be counted.
-    means = np.sort([np.mean(sample) for sample in product(values, repeat=3)])
+def test_a_missing_score_is_nan() -> None:
+    one = of_run()
+    one["groups"]["seen"]["score"] = None
+    assert math.isnan(collate([one])[0].scores[0])
+
+
+def test_two_runs_of_one_seed_are_one_sentence() -> None:
+    with pytest.raises(UsageError, match=r"^a and b both have seed 4 of ctmrl on point_robot_wind"):
+        collate([of_run("a", seed=4), of_run("b", seed=4)])
+
+
+def test_runs_on_different_tasks_are_one_sentence() -> None:
+    other = of_run("b", seed=1)
+    other["groups"]["unseen"]["tasks"] = [1, 2]
+    with pytest.raises(UsageError, match=r"^a and b were scored on different unseen tasks"):
+        collate([of_run("a"), other])
+
+
+def test_the_interval_is_of_the_mean() -> None:
+    values = np.random.default_rng(0).normal(-6.0, 0.5, 29)
     low, high = interval(values)
-    assert low == pytest.approx(means[0], abs=0.02)
-    assert high == pytest.approx(means[-1], abs=0.02)
+    error = values.std(ddof=1) / math.sqrt(len(values))
+    assert low == pytest.approx(values.mean() - 1.96 * error, abs=0.25 * error)
+    assert high == pytest.approx(values.mean() + 1.96 * error, abs=0.25 * error)
     assert interval(values) == (low, high)
+    assert interval(np.full(7, -6.0)) == (-6.0, -6.0)
+    assert all(math.isnan(bound) for bound in interval(values[:1]))
 
 
-def test_one_seed_has_no_interval() -> None:
-    assert np.isnan(interval(np.array([-5.0]))).all()
+def test_the_interquartile_mean() -> None:
+    assert interquartile_mean(np.array([100.0, 1.0, 2.0, 3.0, -100.0, 4.0, 5.0, 0.0])) == 2.5
+    assert interquartile_mean(np.array([7.0])) == 7.0
+    assert interquartile_mean(np.array([1.0, 2.0, 6.0])) == 3.0
 
 
-def test_the_interquartile_mean_leaves_the_outer_quarters_out() -> None:
-    assert interquartile_mean(np.array([0.0, 1.0, 2.0, 100.0])) == 1.5
+def test_the_csv() -> None:
+    text = to_csv(collate([of_run(seed=1), of_run(seed=0)]))
+    rows = list(csv.DictReader(text.splitlines()))
+    assert len(rows) == 4
+    assert rows[0] == {
+        "env": "point_robot_wind",
+        "method": "ctmrl",
+        "group": "seen",
+        "seed": "0",
+        "return": "-8.0000",
+        "score": "88.00",
+    }
+    assert "\r" not in text

@@ -1,0 +1,241 @@
+"""Tables and pictures of evaluations."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+from sklearn.decomposition import PCA
+
+from ctmrl.console import run_command
+from ctmrl.report import (
+    ReportConfig,
+    adaptation_figure,
+    context_figure,
+    main,
+    ordered_groups,
+    plane,
+    result_table,
+    score,
+    summary_table,
+    write_pictures,
+)
+from ctmrl.summary import collate
+from tests.ctmrl.examples import Z, record
+
+
+def cells(table: Table) -> dict[str, list[str]]:
+    """A table's rows by their first cell."""
+    columns = [list(column.cells) for column in table.columns]
+    return {str(first): [str(cell) for cell in rest] for first, *rest in zip(*columns, strict=True)}
+
+
+def printed(table: Table) -> str:
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_the_score() -> None:
+    references = {"random": -30.0, "oracle": -5.0, "best_behavior": -10.0}
+    assert score(-30.0, references) == 0.0
+    assert score(-5.0, references) == 100.0
+    assert score(-12.5, references) == 70.0
+    assert score(-40.0, references) == -40.0
+    # Where the optimum is not known, the best behaviour policy is the expert.
+    assert score(-20.0, {"random": -30.0, "best_behavior": -10.0}) == 50.0
+    assert score(-20.0, {"random": -30.0}) is None
+
+
+def test_groups_are_shown_unseen_first() -> None:
+    assert list(ordered_groups(record())) == ["unseen", "seen"]
+    assert list(ordered_groups(record(groups=("fresh",)))) == ["fresh"]
+
+
+def test_the_result_table() -> None:
+    table = result_table(record(seed=2))
+    # The record's first group, `seen`, has -10, the second -11.
+    assert cells(table) == {
+        "ctmrl (last checkpoint)": ["-11.00", "76.0", "-10.00", "80.0"],
+        "oracle (exact optimum)": ["-5.00", "100.0", "-5.00", "100.0"],
+        "best behaviour policy": ["-5.50", "98.0", "-5.50", "98.0"],
+        "wind-blind controller": ["-6.00", "96.0", "-6.00", "96.0"],
+        "random": ["-30.00", "0.0", "-30.00", "0.0"],
+    }
+    text = printed(table)
+    assert "point_robot_wind, ctmrl, seed 2" in text
+    assert text.index("unseen tasks (5)") < text.index("seen tasks (5)", text.index("unseen") + 9)
+
+
+def test_a_reference_that_a_group_lacks() -> None:
+    shown = record()
+    del shown["groups"]["unseen"]["references"]["best_behavior"]
+    assert cells(result_table(shown))["best behaviour policy"] == ["-", "-", "-5.50", "98.0"]
+    del shown["groups"]["seen"]["references"]["best_behavior"]
+    assert "best behaviour policy" not in cells(result_table(shown))
+
+
+def test_the_plane_is_that_of_the_principal_components() -> None:
+    contexts = np.random.default_rng(0).normal(size=(17, Z)) * np.arange(1, Z + 1)
+    points, share = plane(contexts)
+    pca = PCA(n_components=2).fit(contexts)
+    wanted = pca.transform(contexts)
+    for axis in range(2):
+        sign = np.sign(points[:, axis] @ wanted[:, axis])
+        np.testing.assert_allclose(points[:, axis], sign * wanted[:, axis], atol=1e-9)
+    np.testing.assert_allclose(share, pca.explained_variance_ratio_, rtol=1e-9)
+
+
+def test_the_planes_sign_does_not_depend_on_the_order_of_the_contexts() -> None:
+    contexts = np.random.default_rng(0).normal(size=(17, Z))
+    order = np.random.default_rng(1).permutation(17)
+    np.testing.assert_allclose(plane(contexts[order])[0], plane(contexts)[0][order], atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(1, Z), (17, 1), (1, 1), (2, Z), (17, 2)])
+def test_few_contexts_and_few_numbers_have_a_plane(shape: tuple[int, int]) -> None:
+    contexts = np.random.default_rng(0).normal(size=shape)
+    points, share = plane(contexts)
+    assert points.shape == (shape[0], 2)
+    assert share.shape == (2,)
+    # Distances in the plane are those between the contexts.
+    whole = np.linalg.norm(contexts[:, None] - contexts, axis=2)
+    np.testing.assert_allclose(np.linalg.norm(points[:, None] - points, axis=2), whole, atol=1e-9)
+
+
+def test_equal_contexts_have_a_plane() -> None:
+    points, share = plane(np.ones((5, Z)))
+    assert not points.any()
+    assert not share.any()
+
+
+def texts(axes: Any) -> str:
+    legend = axes.get_legend()
+    labels = [text.get_text() for text in legend.get_texts()] if legend else []
+    return "\n".join([axes.get_title(), axes.get_xlabel(), axes.get_ylabel(), *labels])
+
+
+def test_the_adaptation_figure() -> None:
+    shown = record()
+    figure = adaptation_figure(shown)
+    unseen, seen = figure.axes
+    for axes, name in ((unseen, "unseen"), (seen, "seen")):
+        group = shown["groups"][name]
+        assert f"{name} tasks: {group['return']:.2f}" in texts(axes)
+        assert "wind-blind controller -6.00" in texts(axes)
+        assert "oracle (exact optimum) -5.00" in texts(axes)
+        curve = np.array(group["curve"]).mean(axis=1)
+        lines = [np.asarray(line.get_ydata()) for line in axes.get_lines()]
+        assert any(line.shape == curve.shape and np.allclose(line, curve) for line in lines)
+        low, high = axes.get_ylim()
+        assert low < curve[1:].min()
+        assert high > -5.0
+
+
+@pytest.mark.parametrize(("method", "panels"), [("ctmrl", 2), ("focal", 1)])
+def test_the_context_figure_with_and_without_codes(method: str, panels: int) -> None:
+    shown = record(method)
+    figure = context_figure(shown)
+    drawn = [axes for axes in figure.axes if "coloured by" in axes.get_title()]
+    assert len(drawn) == panels
+    points, _ = plane(np.concatenate([shown["groups"][g]["contexts"] for g in ("unseen", "seen")]))
+    for axes in drawn:
+        found = np.concatenate([np.asarray(part.get_offsets()) for part in axes.collections])
+        np.testing.assert_allclose(found, points)
+    if method == "ctmrl":
+        codes = {code for group in shown["groups"].values() for code in group["codes"]}
+        assert drawn[1].get_title() == f"coloured by code ({len(codes)} in use)"
+
+
+@pytest.mark.parametrize("change", ["fresh", "one parameter", "one task", "no adaptation"])
+def test_records_of_other_shapes_are_drawn(change: str) -> None:
+    shown = record(groups=("fresh",))
+    group = shown["groups"]["fresh"]
+    if change == "one parameter":
+        shown["param_names"] = ["velocity"]
+        group["params"] = [row[:1] for row in group["params"]]
+    elif change == "one task":
+        for key in ("tasks", "params", "contexts", "codes"):
+            group[key] = group[key][:1]
+        group["curve"] = [row[:1] for row in group["curve"]]
+    elif change == "no adaptation":
+        shown["protocol"] |= {"random_episodes": 0, "policy_episodes": 0}
+        group["curve"] = group["curve"][:1]
+    assert len(adaptation_figure(shown).axes) == 1
+    assert len(context_figure(shown).axes) == 3
+
+
+def test_equal_records_give_equal_pictures(tmp_path: Path) -> None:
+    for name in ("first", "second", "other"):
+        (tmp_path / name).mkdir()
+        write_pictures(record(seed=int(name == "other"), groups=("fresh",)), tmp_path / name)
+    for picture in ("adaptation.png", "contexts.png"):
+        first, second, other = (
+            (tmp_path / name / picture).read_bytes() for name in ("first", "second", "other")
+        )
+        assert first == second
+        assert first != other
+        with Image.open(tmp_path / "first" / picture) as image:
+            assert min(image.size) > 300
+            assert "Software" not in image.info
+            assert len(np.unique(np.asarray(image.convert("L")))) > 30
+
+
+def write_records(folder: Path) -> None:
+    for method in ("ctmrl", "focal"):
+        for seed in (0, 1, 3):
+            path = folder / method / f"seed-{seed}" / "evaluation.json"
+            path.parent.mkdir(parents=True)
+            path.write_text(json.dumps(record(method, seed)))
+
+
+def test_the_summary_table() -> None:
+    results = collate([{**record(seed=seed), "run": f"seed-{seed}"} for seed in (0, 1, 3)])
+    (unseen,) = [result for result in results if result.group == "unseen"]
+    rows = cells(summary_table("point_robot_wind", "unseen", [unseen]))
+    value, bounds, iqm, normal, seeds = rows["ctmrl"]
+    assert (value, normal, seeds) == ("-10.333", "78.7", "0 1 3")
+    low, high = map(float, bounds.split(" to "))
+    assert -12.0 <= low < -10.4 < -10.3 < high <= -9.0
+    assert iqm == "-10.333"
+    assert rows["oracle (exact optimum)"][0] == "-5.000"
+    single = collate([{**record(), "run": "seed-0"}])[:1]
+    assert cells(summary_table("point_robot_wind", "seen", single))["ctmrl"][1] == "-"
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_records(tmp_path / "runs")
+    table = tmp_path / "new" / "table.csv"
+    assert run_command(lambda: main(ReportConfig([tmp_path / "runs"], table))) == 0
+    output = capsys.readouterr().out
+    assert "point_robot_wind, unseen tasks" in output
+    assert "focal, seed by seed: -9.000, -10.000, -12.000" in output
+    lines = table.read_text().splitlines()
+    assert lines[0] == "env,method,group,seed,return,score"
+    assert "point_robot_wind,ctmrl,unseen,3,-12.0000,72.00" in lines
+    assert len(lines) == 1 + 2 * 2 * 3
+
+
+def test_a_folder_without_runs_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(lambda: main(ReportConfig([tmp_path]))) == 2
+    assert capsys.readouterr().err == (
+        f"error: no finished run in {tmp_path}: python -m ctmrl.train makes one\n"
+    )
+
+
+def test_a_report_needs_no_torch() -> None:
+    code = "import sys, ctmrl.report; print({'torch', 'matplotlib', 'gymnasium'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
