@@ -10,6 +10,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ctmrl.cqvae import cosine, match, moving_update
+from ctmrl.errors import UsageError
+
+
+def check_codes(codes: int, tasks: int) -> None:
+    """Check that a codebook fits the number of training tasks.
+
+    Raises:
+        UsageError: not fewer codes than training tasks, or none.
+    """
+    if not 1 <= codes < tasks:
+        raise UsageError(
+            f"--codes must be at least 1 and less than the {tasks} training tasks, got {codes}"
+        )
 
 
 def kmeans(contexts: Tensor, n_codes: int, seed: int) -> Tensor:

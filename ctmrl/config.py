@@ -50,7 +50,7 @@ class RunConfig:
     env: str = "point_robot_wind"
     """Environment: short name, id or hyphenated name."""
     method: str = "ctmrl"
-    """Context-learning method: ctmrl or focal."""
+    """Context-learning method: ctmrl, ctmrl_released (as its published code has it) or focal."""
     preset: Preset = "standard"
     """Where the defaults of all other options come from: standard, paper (sizes of the field, hours
     on a small machine) or smoke (seconds, learns little)."""
@@ -80,6 +80,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("learning_rate", "encoder_lr", "dual_lr", "regularizer"), (0, math.inf)),
     **dict.fromkeys(("gamma", "target_rate", "eta", "warm_up", "refresh"), _SHARE),
     **dict.fromkeys(("reward_scale", "tau"), (1e-9, math.inf)),
+    "code_decay": _SHARE,
     "meta_batch": (2, math.inf),
     "seed": (0, 2**63 - 1),
 }

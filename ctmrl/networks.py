@@ -38,6 +38,11 @@ class Standardize(nn.Module):
         """Standardised x, [*, D]."""
         return (x - self.mean) * self.scale
 
+    def inverse(self, standardized: Tensor) -> Tensor:
+        """The x, [*, D], that `forward` standardises to this; the mean in constant columns."""
+        std = torch.where(self.scale > 0, self.scale.reciprocal(), 0.0)
+        return self.mean + standardized * std
+
 
 class Statistics(NamedTuple):
     """Mean and standard deviation of the training tasks' data.

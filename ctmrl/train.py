@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -136,7 +137,8 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
     folder = runs.RunFolder(path, settings, config.restart)
     try:
         if folder.finished:
-            console.print(f"{path} is finished; --restart trains it anew, --seed n another.")
+            done = f"{path} is finished; --restart trains it anew, --seed n another."
+            console.print(done, soft_wrap=True)
             return runs.read_json(path / runs.EVALUATION)
         _meta_train(config, learner, folder, console)
         return _evaluate(config, learner, folder, split, best_behavior(dataset))
@@ -166,9 +168,12 @@ def _meta_train(config: RunConfig, learner: Learner, folder: RunFolder, console:
     log_every = max(steps // LOGS, 1)
     save_every = log_every * max(LOGS // CHECKPOINTS, 1)
     measure_every = log_every * max(LOGS // RETURNS, 1)
-    writer = _tensorboard(folder.path, learner.step) if config.tensorboard else None
     n_codes = getattr(config.context, "codes", None)
-    with TrainingDisplay(console, steps, learner.step, n_codes) as display:
+    with ExitStack() as stack:
+        writer = None
+        if config.tensorboard:
+            writer = stack.enter_context(_tensorboard(folder.path, learner.step))
+        display = stack.enter_context(TrainingDisplay(console, steps, learner.step, n_codes))
         for metrics in meta_train(
             learner, log_every, lambda: folder.save_checkpoint(learner.state()), save_every
         ):

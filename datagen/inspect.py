@@ -22,7 +22,7 @@ from meta_envs import normalized_score
 
 PLAIN_WIDTH = 140
 """Columns of the table where the output is not a terminal."""
-PICTURES = (".png", ".pdf", ".svg")
+PICTURES = (".png", ".pdf")
 """Kinds of picture `--plot` writes."""
 MOST_PARAMS = 3
 """Parameters of a task the table shows; some environments have dozens."""
@@ -35,7 +35,7 @@ class InspectConfig:
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the dataset."""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Picture to write (.png, .pdf or .svg): returns by checkpoint, and episodes."""
+    """Picture to write (.png or .pdf): returns by checkpoint, and episodes."""
 
 
 def score(returns: Mapping[str, float], name: str) -> float:
@@ -98,7 +98,7 @@ def _numbers(records: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> li
 def check_picture(path: Path) -> None:
     """Raise a ValueError unless a picture can be written there."""
     if path.suffix.lower() not in PICTURES:
-        raise ValueError(f"--plot {path} must end in one of {', '.join(PICTURES)}")
+        raise ValueError(f"--plot {path} must end in {' or '.join(PICTURES)}")
     if not path.parent.is_dir():
         raise ValueError(f"--plot {path}: there is no folder {path.parent}, make it first")
 

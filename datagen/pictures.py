@@ -22,8 +22,8 @@ from meta_envs.registry import definition
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHOWN_TASKS = 6
-"""Tasks whose episodes are drawn."""
+SHOWN_TRAIN, SHOWN_TEST = 4, 2
+"""Train and test tasks whose episodes are drawn."""
 EPISODES_A_CHECKPOINT = 2
 """Episodes of each checkpoint that are drawn of a task."""
 TRAIN, TEST = "#1f5fa8", "#c8601a"
@@ -37,7 +37,7 @@ def draw(dataset: Dataset, path: Path) -> None:
 
     Args:
         dataset: any.
-        path: a .png, .pdf or .svg file.
+        path: a .png or a .pdf file.
 
     Raises:
         DatasetError: a task's file is damaged.
@@ -51,7 +51,7 @@ def draw(dataset: Dataset, path: Path) -> None:
     )
     _draw_returns(left.subplots(), dataset.index["tasks"])
     if _in_the_plane(dataset.env):
-        _draw_paths(right, [dataset.read(task) for task in _spread(dataset.tasks.tolist())])
+        _draw_paths(right, [dataset.read(task) for task in _shown_tasks(dataset)])
     else:
         _draw_histogram(right.subplots(), [dataset.read(int(task)) for task in dataset.tasks])
     # No date and no version, so that the same dataset gives the same picture.
@@ -63,14 +63,16 @@ def _in_the_plane(env: str) -> bool:
 
 
 def _without_date(path: Path) -> dict[str, None]:
-    keys = {".png": ("Software",), ".pdf": ("CreationDate",), ".svg": ("Date",)}
-    return dict.fromkeys(keys[path.suffix.lower()])
+    return {"CreationDate": None} if path.suffix.lower() == ".pdf" else {"Software": None}
 
 
-def _spread(tasks: Sequence[int]) -> list[int]:
-    """A few tasks at equal distances."""
-    rows = np.linspace(0, len(tasks) - 1, min(SHOWN_TASKS, len(tasks))).round().astype(int)
-    return [tasks[row] for row in rows]
+def _shown_tasks(dataset: Dataset) -> list[int]:
+    """A few train tasks and fewer test tasks, of each kind some at equal distances."""
+    shown: set[int] = set()
+    for tasks, most in ((dataset.train_tasks, SHOWN_TRAIN), (dataset.test_tasks, SHOWN_TEST)):
+        rows = np.linspace(0, len(tasks) - 1, min(most, len(tasks))).round().astype(int)
+        shown.update(tasks[rows].tolist())
+    return sorted(shown)
 
 
 def _draw_returns(axes: Axes, records: Sequence[Mapping[str, Any]]) -> None:
@@ -101,7 +103,7 @@ def _draw_paths(figure: SubFigure, tasks: Sequence[TaskData]) -> None:
     """Small pictures of a few tasks' episodes, coloured by return on one scale."""
     returns = [episode_returns(data.columns) for data in tasks]
     scale = Normalize(*np.quantile(np.concatenate(returns), [0.05, 1.0]))
-    columns = min(3, len(tasks))
+    columns = min(2, len(tasks))
     grid = figure.subplots(
         -(-len(tasks) // columns), columns, sharex=True, sharey=True, squeeze=False
     )

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from ctmrl.methods.base import Method, MethodConfig
 from ctmrl.methods.ctmrl import CTMRL, CTMRLConfig
+from ctmrl.methods.ctmrl_released import CTMRLReleased, CTMRLReleasedConfig
 from ctmrl.methods.focal import FOCAL, FOCALConfig
 
 
@@ -19,5 +20,8 @@ class Row(NamedTuple):
 
 METHODS: dict[str, Row] = {
     "ctmrl": Row(CTMRL, CTMRLConfig, "codebook of cross-task contexts (the source paper)"),
+    "ctmrl_released": Row(
+        CTMRLReleased, CTMRLReleasedConfig, "CTMRL as the source paper's published code has it"
+    ),
     "focal": Row(FOCAL, FOCALConfig, "distance metric between contexts (Li et al. 2021)"),
 }

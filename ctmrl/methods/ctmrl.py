@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 
 from ctmrl import cqvae
-from ctmrl.codebook import Codebook, perplexity
-from ctmrl.errors import UsageError
+from ctmrl.codebook import Codebook, check_codes, perplexity
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
 from ctmrl.networks import Predictors, Statistics
+from ctmrl.schedule import COLLECTIONS, Schedule
+
+__all__ = ["COLLECTIONS", "CTMRL", "CTMRLConfig"]
 
 
 @dataclass(frozen=True)
@@ -52,10 +54,6 @@ class CTMRLConfig(MethodConfig):
     """Widths of the predictors' hidden layers."""
 
 
-COLLECTIONS = 10
-"""Times the contexts of all training tasks are collected for one run of K-means."""
-
-
 class CTMRL(Method):
     """CTMRL: encoder, codebook, and reward and state predictors, trained end to end."""
 
@@ -68,11 +66,7 @@ class CTMRL(Method):
             UsageError: not fewer codes than training tasks, or none.
         """
         super().__init__(config, statistics, dims)
-        if not 1 <= config.codes < dims.tasks:
-            raise UsageError(
-                f"--codes must be at least 1 and less than the {dims.tasks} training tasks, "
-                f"got {config.codes}"
-            )
+        check_codes(config.codes, dims.tasks)
         self.config = config
         self.predictors = Predictors(statistics, dims.act, config.z_dim, config.predictor_hidden)
         start = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
@@ -80,7 +74,7 @@ class CTMRL(Method):
         self.collected: Tensor
         empty = torch.zeros(COLLECTIONS, dims.tasks, config.z_dim)
         self.register_buffer("collected", empty)
-        self._schedule = Schedule(config, dims.steps)
+        self._schedule = Schedule(config.warm_up, config.refresh, dims.steps)
 
     def before_step(self, step: int, all_contexts: Callable[[], Tensor]) -> None:
         """Collect contexts, place the codebook after the warm-up, refresh it at its interval."""
@@ -161,33 +155,3 @@ class CTMRL(Method):
     def code_of(self, z: Tensor) -> Tensor:
         """Equation (1)."""
         return self.codebook.match(z)
-
-
-class Schedule:
-    """Which steps collect contexts and which run K-means."""
-
-    def __init__(self, config: CTMRLConfig, steps: int) -> None:
-        """Turn shares of the run into steps."""
-        self.start = max(round(config.warm_up * steps), 1)
-        self.period = max(round(config.refresh * steps), 1)
-        self.first = max(round(config.warm_up * steps / 3), 1)
-
-    def _interval(self, step: int) -> tuple[int, int]:
-        """First step and length of the collecting interval that ends at or after `step`."""
-        if step <= self.start:
-            return self.start - self.first, self.first
-        passed = (step - self.start - 1) // self.period
-        return self.start + passed * self.period, self.period
-
-    def ends_interval(self, step: int) -> bool:
-        """Whether K-means runs before this step."""
-        begin, length = self._interval(step)
-        return step == begin + length
-
-    def slots(self, step: int) -> range:
-        """Slots of the collection to fill before this step, none for most steps."""
-        begin, length = self._interval(step)
-        if step <= begin:
-            return range(0)
-        before, now = (((step - begin - k) * COLLECTIONS) // length for k in (1, 0))
-        return range(before, now)

@@ -46,6 +46,12 @@ def test_standardize_and_constant_columns() -> None:
     assert set(Standardize(mean, std).state_dict()) == {"mean", "scale"}
 
 
+def test_the_inverse_of_standardising_gives_the_mean_in_constant_columns() -> None:
+    mean, std = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 0.0, 0.5])
+    found = Standardize(mean, std).inverse(torch.tensor([[1.0, 9.0, 0.0], [0.0, -9.0, -2.0]]))
+    assert found.tolist() == [[3.0, 2.0, 3.0], [1.0, 2.0, 2.0]]
+
+
 @pytest.mark.parametrize("next_obs", [True, False])
 def test_a_context_is_the_mean_of_its_transitions_encodings(next_obs: bool) -> None:
     stats, h = statistics(next_obs), contexts()

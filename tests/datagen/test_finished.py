@@ -13,7 +13,7 @@ import pytest
 
 from datagen import finished
 from datagen.budgets import budget
-from datagen.dataset import DatasetError, TaskData, open_dataset, task_file, write_task
+from datagen.dataset import DatasetError, TaskData, open_dataset, task_file, write_index, write_task
 from datagen.finished import remove_stale, scan, without_versions, write_summary
 from datagen.job import origin
 from tests.datagen.examples import task_data
@@ -125,7 +125,7 @@ def test_a_task_that_another_shard_finished_meanwhile_is_in_the_index(
             put(folder, task)
             break
 
-    original = finished.write_index
+    original = write_index
     monkeypatch.setattr(finished, "write_index", write_index_slowly)
     write_summary(tmp_path, ORIGIN)
     assert open_dataset(tmp_path).tasks.tolist() == [1, 2, 3]

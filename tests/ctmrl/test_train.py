@@ -1,0 +1,475 @@
+"""`python -m ctmrl.train` as its users run it: what it makes, what it refuses, what it survives."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+
+from ctmrl import train as command
+from ctmrl.config import RunConfig
+from ctmrl.console import run_command
+from ctmrl.errors import UsageError
+from ctmrl.methods import METHODS
+from ctmrl.methods.ctmrl import CTMRLConfig
+from ctmrl.methods.focal import FOCALConfig
+from ctmrl.presets import preset
+from ctmrl.runs import load_checkpoint, read_json
+from ctmrl.train import best_behavior, default_folder, parse, split_tasks, train
+from datagen.dataset import open_dataset, task_file
+from meta_envs import ENVIRONMENTS, task_set
+from tests.ctmrl.commands import FILES, Commands, contents, rows, wait_until
+from tests.ctmrl.conftest import FinishedRun
+from tests.ctmrl.examples import smoke
+from tests.datagen.examples import write_dataset
+
+SHORT = ("--random-episodes", "1", "--policy-episodes", "1")
+"""The shortest adaptation of two phases."""
+
+
+def run(config: RunConfig, **changes: Any) -> tuple[dict[str, Any], str]:
+    """Train in this process; the evaluation's record, and what was shown."""
+    console = Console(file=io.StringIO(), width=200)
+    record = train(dataclasses.replace(config, **changes), console)
+    assert isinstance(console.file, io.StringIO)
+    return record, console.file.getvalue()
+
+
+def short(steps: int = 3, **changes: Any) -> RunConfig:
+    config = smoke(steps, **changes)
+    protocol = dataclasses.replace(config.meta_test, random_episodes=1, policy_episodes=1)
+    return dataclasses.replace(config, meta_test=protocol)
+
+
+def metrics(path: Path) -> list[dict[str, str]]:
+    with (path / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_what_a_run_makes(finished_run: FinishedRun, wind_path: Path) -> None:
+    path = finished_run.path
+    assert tuple(sorted(contents(path))) == FILES
+    stored = read_json(path / "config.json")
+    dataset = open_dataset(wind_path)
+    assert stored["dataset"] == dataset.hash
+    assert stored["groups"]["seen"] == dataset.train_tasks.tolist()
+    assert stored["groups"]["unseen"] == task_set("point_robot_wind").test_tasks.tolist()
+    assert stored["dimensions"] == {"obs": 2, "act": 2, "tasks": 7, "steps": 40}
+    assert stored["settings"]["training"]["steps"] == 40
+    assert stored["versions"]["torch"].startswith(torch.__version__.partition("+")[0])
+    # Where a run lies, and from where its data were read, is not part of it.
+    assert not {"data", "out", "restart", "tensorboard"} & stored["settings"].keys()
+    state = torch.load(path / "checkpoint.pt", weights_only=True)
+    assert int(state["step"]) == 40
+    assert all(value.isfinite().all() for value in state.values())
+    for name in ("adaptation.png", "contexts.png"):
+        with Image.open(path / name) as image:
+            image.verify()
+
+
+def test_what_a_run_logs(finished_run: FinishedRun) -> None:
+    found = metrics(finished_run.path)
+    assert [int(row["step"]) for row in found] == list(range(1, 41))
+    names = {"loss/critic", "loss/actor", "loss/encoder/contrast", "codes/perplexity"}
+    assert names <= found[0].keys()
+    measured = [int(row["step"]) for row in found if row["return/training_tasks"]]
+    assert measured == [10, 20, 30, 40]
+    record = read_json(finished_run.path / "evaluation.json")
+    # One repetition, the run's seed: the last return on training tasks is that of the evaluation.
+    last = float(found[-1]["return/training_tasks"])
+    assert last == pytest.approx(record["groups"]["seen"]["return"], rel=1e-9)
+
+
+def test_what_a_run_shows(finished_run: FinishedRun) -> None:
+    record = read_json(finished_run.path / "evaluation.json")
+    lines = finished_run.output.splitlines()
+    progress = [line for line in lines if line.startswith("step ")]
+    assert [line.partition(":")[0] for line in progress] == [
+        f"step {step}/40" for step in (10, 20, 30, 40)
+    ]
+    assert all("codes in use" in line and "return on training tasks" in line for line in progress)
+    assert "unseen tasks (10)" in finished_run.output
+    for group in record["groups"].values():
+        (row,) = [line for line in lines if "ctmrl (last checkpoint)" in line]
+        assert f"{group['return']:.2f}" in row
+        assert f"{group['score']:.1f}" in row
+    assert lines[-1] == f"Pictures, metrics and checkpoint: {finished_run.path}"
+
+
+def test_a_finished_run_is_not_trained_again(finished_run: FinishedRun, commands: Commands) -> None:
+    before = {path: path.stat().st_mtime_ns for path in finished_run.path.iterdir()}
+    assert commands.run(*finished_run.words, "--out", str(finished_run.path)) == 0
+    assert {path: path.stat().st_mtime_ns for path in finished_run.path.iterdir()} == before
+    output = commands.output()
+    first, _, table = output.partition("\n")
+    assert first.endswith("is finished; --restart trains it anew, --seed n another.")
+    assert table.strip() in finished_run.output
+
+
+def test_other_settings_do_not_touch_a_run(finished_run: FinishedRun, commands: Commands) -> None:
+    before = contents(finished_run.path)
+    words = (*finished_run.words, "--out", str(finished_run.path), "--seed", "1")
+    assert commands.run(*words) == 2
+    assert commands.output() == (
+        f"error: {finished_run.path} holds a run with settings.seed = 0, this one has 1: "
+        "choose another --out, or --restart to throw it away\n"
+    )
+    assert contents(finished_run.path) == before
+
+
+def test_a_restart_trains_anew(finished_run: FinishedRun, wind_path: Path, tmp_path: Path) -> None:
+    path = shutil.copytree(finished_run.path, tmp_path / "copy")
+    run(short(), data=wind_path, out=path, restart=True)
+    assert tuple(sorted(contents(path))) == FILES
+    assert len(metrics(path)) == 3
+    assert int(load_checkpoint(path / "checkpoint.pt")["step"]) == 3
+
+
+def test_an_interrupted_and_twice_killed_run_ends_in_the_same_bytes(
+    finished_run: FinishedRun, commands: Commands, tmp_path: Path
+) -> None:
+    path = tmp_path / "run"
+    words = (*finished_run.words, "--out", str(path))
+    commands.start(*words)
+    wait_until(lambda: rows(path / "metrics.csv") > 7)
+    commands.send(signal.SIGINT)
+    assert commands.wait() == 130
+    assert commands.output().splitlines()[-1] == (
+        "Stopped. The same command goes on from the last checkpoint."
+    )
+    assert "Traceback" not in commands.output()
+    reached = int(load_checkpoint(path / "checkpoint.pt")["step"])
+    assert 0 < reached < 40
+    commands.start(*words)
+    wait_until(lambda: rows(path / "metrics.csv") > 25)
+    commands.send(signal.SIGKILL)
+    assert commands.wait() == -signal.SIGKILL
+    assert commands.output().splitlines()[0] == f"Going on at step {reached} of 40."
+    assert int(load_checkpoint(path / "checkpoint.pt")["step"]) < 40
+    commands.start(*words)
+    wait_until((path / "adaptation.png").exists)
+    commands.send(signal.SIGKILL)
+    assert commands.wait() == -signal.SIGKILL
+    assert not (path / "evaluation.json").exists()
+    assert commands.run(*words) == 0, commands.output()
+    assert commands.output().splitlines()[0] == "Going on at step 40 of 40."
+    assert contents(path) == contents(finished_run.path)
+
+
+@pytest.mark.slow
+def test_runs_killed_at_20_random_moments_end_in_the_same_bytes(
+    finished_run: FinishedRun, commands: Commands, tmp_path: Path
+) -> None:
+    wanted = contents(finished_run.path)
+    begun = time.monotonic()
+    assert commands.run(*finished_run.words, "--out", str(tmp_path / "whole")) == 0
+    length = time.monotonic() - begun
+    draw, killed, had_checkpoint = random.Random(0), 0, 0
+    for number in range(20):
+        path = tmp_path / str(number)
+        words = (*finished_run.words, "--out", str(path))
+        commands.start(*words)
+        time.sleep(length * (number + draw.random()) / 20)
+        commands.send(signal.SIGKILL)
+        killed += commands.wait() == -signal.SIGKILL
+        had_checkpoint += (path / "checkpoint.pt").exists()
+        assert commands.run(*words) == 0, commands.output()
+        assert contents(path) == wanted, number
+    # That the moments were spread over the whole run:
+    assert killed >= 12
+    assert 4 <= had_checkpoint <= 19
+
+
+def test_the_module_itself_is_the_command(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "ctmrl.train", "--method", "ctmlr"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == (
+        f"error: no method 'ctmlr'; did you mean 'ctmrl'? (known: {', '.join(METHODS)})\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def mistake(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    wind_path: Path,
+    tmp_path: Path,
+) -> Any:
+    """Runs the command with a mistake in it; returns the one sentence it ends with."""
+
+    def run_it(*words: str, data: Path = wind_path) -> str:
+        monkeypatch.chdir(tmp_path)
+        arguments = ["--preset", "smoke", "--data", str(data), "--out", "out", *words]
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        assert run_command(command.main) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("\n") == 1
+        return captured.err.removeprefix("error: ").strip()
+
+    return run_it
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ("--env", "point-robt"),
+            "no environment 'point-robt'; did you mean 'point_robot'? "
+            f"(known: {', '.join(ENVIRONMENTS)})",
+        ),
+        (("--method", "pearl"), f"no method 'pearl' (known: {', '.join(METHODS)})"),
+        (("--preset", "huge"), "no preset 'huge' (known: standard, paper, smoke)"),
+        (
+            ("--codes", "7"),
+            "--codes must be at least 1 and less than the 7 training tasks, got 7",
+        ),
+        (
+            ("--context-episodes", "4"),
+            "contexts need 2 x 4 different episodes a task, the dataset has 6: "
+            "collect more or lower --context-episodes",
+        ),
+        (("--steps", "0"), "--steps must be at least 1, got 0"),
+        (("--tau", "nan"), "--tau must be at least 1e-09, got nan"),
+        (("--seed", "-1"), "--seed must be from 0 to 9.22337e+18, got -1"),
+    ],
+)
+def test_mistakes_are_one_sentence_and_leave_nothing(
+    words: tuple[str, ...], said: str, mistake: Any, tmp_path: Path
+) -> None:
+    assert mistake(*words) == said
+    assert not (tmp_path / "out").exists()
+
+
+def test_wrong_data_is_one_sentence(
+    mistake: Any, wind_path: Path, sparse_path: Path, tmp_path: Path
+) -> None:
+    assert mistake(data=tmp_path / "none").startswith(f"{tmp_path / 'none'}: no dataset is there; ")
+    assert mistake(data=sparse_path) == (
+        f"{sparse_path} is of sparse_point_robot, not of point_robot_wind: "
+        "give --env sparse_point_robot or another --data"
+    )
+    damaged = shutil.copytree(wind_path, tmp_path / "damaged")
+    (damaged / task_file(4)).write_bytes(b"x")
+    assert "task_004.h5" in mistake(data=damaged)
+    single = write_dataset(tmp_path / "single", tasks=(0, 2, 7))
+    assert mistake(data=single).startswith(
+        f"{single} has 1 training tasks, at least 2 are needed: "
+    )
+    pair = write_dataset(tmp_path / "pair", tasks=(0, 1))
+    assert mistake("--validate", "--codes", "1", data=pair) == (
+        f"--validate needs at least 3 training tasks, {pair} has 2: collect more"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_something_else_is_left_alone(mistake: Any, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("x")
+    for words in ((), ("--restart",)):
+        assert mistake(*words) == "out holds files that are not of a run: choose another --out"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--no-such-option", "3"), ("--steps", "many"), ("--codes",), ("stray",)],
+    ids=str,
+)
+def test_what_is_no_option_is_told_and_exits_with_2(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        parse(["--preset", "smoke", *words])
+    assert caught.value.code == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err + captured.out
+    assert words[0].strip("-") in captured.err
+
+
+def test_an_option_of_another_method_is_no_option() -> None:
+    assert isinstance(parse(["--codes", "3"]).context, CTMRLConfig)
+    with pytest.raises(SystemExit):
+        parse(["--method", "focal", "--codes", "3"])
+
+
+def test_help_shows_the_options_of_the_method(capsys: pytest.CaptureFixture[str]) -> None:
+    texts = {}
+    for method in ("ctmrl", "focal"):
+        with pytest.raises(SystemExit) as caught:
+            parse(["--method", method, "--help"])
+        assert caught.value.code == 0
+        texts[method] = capsys.readouterr().out
+    for option in ("--env", "--steps", "--restart", "--validate", "--metric-weight"):
+        assert all(option in text for text in texts.values())
+    for option in ("--codes", "--no-kmeans", "--no-code-contrast"):
+        assert option in texts["ctmrl"]
+        assert option not in texts["focal"]
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        ([], preset("point_robot_wind", "ctmrl", "standard")),
+        (["--env", "PointRobot-v0"], preset("point_robot", "ctmrl", "standard")),
+        (["--env=point-robot-wind"], preset("point_robot_wind", "ctmrl", "standard")),
+        (["--env", "sparse-point-robot", "--method", "focal", "--preset", "paper"],
+         preset("sparse_point_robot", "focal", "paper")),
+        (["--preset", "smoke", "--seed", "7"],
+         preset("point_robot_wind", "ctmrl", "smoke", seed=7)),
+        (["--seed", "7", "--data", "d", "--out", "o", "--restart", "--validate"],
+         preset("point_robot_wind", "ctmrl", "standard", seed=7, data=Path("d"), out=Path("o"),
+                restart=True, validate=True)),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_the_command_line(words: list[str], wanted: RunConfig) -> None:
+    assert parse(words) == wanted
+
+
+def test_the_ablations_and_other_switches_of_the_command_line() -> None:
+    ablations = "--no-code-contrast --no-cross-prediction --no-kmeans --no-contrast"
+    sizes = "--codes 3 --encoder-hidden 5 7 --hidden 11 --no-decay"
+    brac = "--behavior-regularization --dual-penalty gradient --timeouts-as-terminals"
+    config = parse(f"{ablations} {sizes} {brac}".split())
+    context = config.context
+    assert isinstance(context, CTMRLConfig)
+    switches = (context.code_contrast, context.cross_prediction, context.kmeans, context.contrast)
+    assert switches == (False,) * 4
+    assert (context.codes, context.encoder_hidden) == (3, (5, 7))
+    assert config.actor_critic.hidden == (11,)
+    assert config.actor_critic.behavior_regularization
+    assert config.actor_critic.dual_penalty == "gradient"
+    assert config.actor_critic.timeouts_as_terminals
+    assert not config.training.decay
+    default = parse(["--method", "focal", "--metric-weight", "3"]).context
+    assert isinstance(default, FOCALConfig)
+    assert default.metric_weight == 3.0
+
+
+def test_where_runs_go() -> None:
+    config = preset("point_robot", "focal", "smoke", seed=3)
+    assert default_folder(config) == Path("runs/point_robot/focal/seed-3")
+    validating = dataclasses.replace(config, validate=True)
+    assert default_folder(validating) == Path("runs/point_robot/focal-validation/seed-3")
+
+
+def test_the_split(wind_path: Path) -> None:
+    dataset = open_dataset(wind_path)
+    plain, validating = split_tasks(dataset, False), split_tasks(dataset, True)
+    assert plain.train.tolist() == [0, 1, 3, 4, 5, 6, 8]
+    assert plain.unseen.tolist() == [2, 7, 12, 17, 22, 27, 32, 37, 42, 47]
+    assert validating.train.tolist() == [0, 1, 4, 5, 6, 8]
+    assert validating.unseen.tolist() == [3]
+
+
+def test_the_best_behaviour_of_each_task(wind_path: Path) -> None:
+    found = best_behavior(open_dataset(wind_path))
+    index = json.loads((wind_path / "dataset.json").read_bytes())
+    assert found == {
+        one["task"]: max(one["returns"]["deterministic"].values()) for one in index["tasks"]
+    }
+    assert len(found) == 9
+
+
+def test_validation_reads_and_uses_no_meta_test_task_and_no_held_out_one(
+    wind_path: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(wind_path, tmp_path / "wind")
+    for task in (2, 7):
+        (folder / task_file(task)).unlink()
+    (folder / task_file(3)).write_bytes(b"damaged")
+    record, _ = run(short(), data=folder, out=tmp_path / "run", validate=True)
+    unseen, seen = record["groups"]["unseen"], record["groups"]["seen"]
+    assert unseen["tasks"] == [3]
+    assert seen["tasks"] == [0, 1, 4, 5, 6, 8]
+    assert not {*unseen["tasks"], *seen["tasks"]} & {*task_set("point_robot_wind").test_tasks}
+    stored = read_json(tmp_path / "run" / "config.json")
+    assert stored["dimensions"]["tasks"] == 6
+    assert stored["groups"] == {"unseen": [3], "seen": [0, 1, 4, 5, 6, 8]}
+    with pytest.raises(ValueError, match="task_003"):
+        run(short(), data=folder, out=tmp_path / "other")
+
+
+@dataclasses.dataclass(frozen=True)
+class SparseRun:
+    """A run of FOCAL on the sparse robot, with TensorBoard events."""
+
+    path: Path
+    record: dict[str, Any]
+    shown: str
+
+
+@pytest.fixture(scope="module")
+def sparse_run(sparse_path: Path, tmp_path_factory: pytest.TempPathFactory) -> SparseRun:
+    path = tmp_path_factory.mktemp("sparse") / "run"
+    config = preset("sparse_point_robot", "focal", "smoke", data=sparse_path, out=path)
+    training = dataclasses.replace(config.training, steps=3)
+    record, shown = run(config, training=training, meta_test=short().meta_test, tensorboard=True)
+    return SparseRun(path, record, shown)
+
+
+def test_a_method_without_codes_and_a_sparse_reward(sparse_run: SparseRun) -> None:
+    # The return of a policy that has not found the goal is exactly 0.
+    assert "return on training tasks 0.00; " in sparse_run.shown
+    assert "codes" not in sparse_run.shown
+    assert sparse_run.record["groups"]["seen"]["return"] == 0.0
+    assert sparse_run.record["groups"]["seen"]["codes"] is None
+    assert metrics(sparse_run.path)[-1]["return/training_tasks"] == "0.0"
+
+
+def test_tensorboard_events(sparse_run: SparseRun) -> None:
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator"
+    ).EventAccumulator
+    events = accumulator(str(sparse_run.path / "tensorboard"))
+    events.Reload()
+    losses = events.Scalars("loss/critic")
+    values = [float(row["loss/critic"]) for row in metrics(sparse_run.path)]
+    assert [event.step for event in losses] == [1, 2, 3]
+    assert [event.value for event in losses] == pytest.approx(values)
+    assert [event.step for event in events.Scalars("return/training_tasks")] == [3]
+
+
+def test_a_run_that_diverges_is_one_sentence_and_leaves_no_nan(
+    wind_path: Path, tmp_path: Path
+) -> None:
+    config = short(steps=20)
+    broken = dataclasses.replace(config.actor_critic, learning_rate=1e30)
+    with pytest.raises(UsageError, match=r"^training diverged: loss/\w+ is (nan|inf) before step"):
+        run(config, actor_critic=broken, data=wind_path, out=tmp_path / "run")
+    for row in metrics(tmp_path / "run") if (tmp_path / "run" / "metrics.csv").exists() else []:
+        assert all(np.isfinite(float(value)) for value in row.values() if value)
+    assert not (tmp_path / "run" / "evaluation.json").exists()
+
+
+def test_a_checkpoint_of_another_run_is_one_sentence(
+    finished_run: FinishedRun, wind_path: Path, tmp_path: Path
+) -> None:
+    path = shutil.copytree(finished_run.path, tmp_path / "copy")
+    (path / "evaluation.json").unlink()
+    state = load_checkpoint(path / "checkpoint.pt")
+    key = "actor_critic/actor.net.0.weight"
+    for wrong in ({}, {**state, key: state[key][:, :3]}):
+        torch.save(wrong, path / "checkpoint.pt")
+        with pytest.raises(
+            UsageError, match=r"does not fit its run .*: train again with --restart"
+        ):
+            run(smoke(40), data=wind_path, out=path)
