@@ -57,7 +57,11 @@ class OfflineData:
     """
 
     def __init__(
-        self, dataset: Dataset, tasks: NDArray[np.int64], timeouts_as_terminals: bool = False
+        self,
+        dataset: Dataset,
+        tasks: NDArray[np.int64],
+        timeouts_as_terminals: bool = False,
+        dense_context: bool = False,
     ) -> None:
         """Read the tasks.
 
@@ -65,6 +69,7 @@ class OfflineData:
             dataset: an open dataset.
             tasks: rows of the task set; nothing of other tasks is read.
             timeouts_as_terminals: treat the time limit as a real end, the field's habit.
+            dense_context: on a sparse environment, let contexts see the dense reward.
 
         Raises:
             DatasetError: a file is damaged.
@@ -75,7 +80,7 @@ class OfflineData:
         self.act_dim = parts[0].columns["actions"].shape[1]
         self._layout = _Layout(self.obs_dim, self.act_dim)
         self.table = torch.from_numpy(
-            np.concatenate([_rows(part, timeouts_as_terminals) for part in parts])
+            np.concatenate([_rows(part, timeouts_as_terminals, dense_context) for part in parts])
         )
         lengths = [np.bincount(part.columns["episode"]) for part in parts]
         self._task_rows = torch.tensor([len(part) for part in parts])
@@ -167,7 +172,7 @@ class OfflineData:
         return gathered.view(sets, len(tasks), n, width)
 
 
-def _rows(data: TaskData, timeouts_as_terminals: bool) -> NDArray[np.float32]:
+def _rows(data: TaskData, timeouts_as_terminals: bool, dense_context: bool) -> NDArray[np.float32]:
     columns = data.columns
     terminal = columns["terminals"]
     if timeouts_as_terminals:
@@ -177,7 +182,7 @@ def _rows(data: TaskData, timeouts_as_terminals: bool) -> NDArray[np.float32]:
         [
             columns["observations"],
             columns["actions"],
-            columns["rewards"][:, None],
+            (learned if dense_context else columns["rewards"])[:, None],
             columns["next_observations"],
             learned[:, None],
             terminal[:, None],

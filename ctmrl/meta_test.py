@@ -53,6 +53,7 @@ class _Adaptation:
         self, env: MetaVectorEnv, encoder: ContextEncoder, actor: Actor, seed: int
     ) -> None:
         self.env, self.encoder, self.actor = env, encoder, actor
+        self.dense = encoder.sees_dense_reward and env.definition.sparse
         self.shape = env.action_space.shape or ()
         self.noise = np.random.default_rng(seed)
         self.generator = torch.Generator().manual_seed(seed)
@@ -84,10 +85,11 @@ class _Adaptation:
         returns = np.zeros(self.env.num_envs)
         while running.any():
             action = act(torch.from_numpy(obs))
-            next_obs, reward, terminated, truncated, _ = self.env.step(action)
+            next_obs, reward, terminated, truncated, info = self.env.step(action)
             returns += np.where(running, reward, 0.0)
             if explore:
-                rows = (obs, action, reward[:, None].astype(np.float32), next_obs)
+                seen = info["dense_reward"] if self.dense else reward
+                rows = (obs, action, seen[:, None].astype(np.float32), next_obs)
                 encoded = self.encoder.encode(torch.from_numpy(np.concatenate(rows, axis=1)))
                 keep = torch.from_numpy(running)[:, None]
                 self.total += torch.where(keep, encoded.double(), 0.0)

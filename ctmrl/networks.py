@@ -62,10 +62,16 @@ class ContextEncoder(nn.Module):
     """e(h): context transitions -> encodings in (-1, 1); a context is their mean."""
 
     def __init__(
-        self, statistics: tuple[Tensor, Tensor], obs_dim: int, hidden: tuple[int, ...], z_dim: int
+        self,
+        statistics: tuple[Tensor, Tensor],
+        obs_dim: int,
+        hidden: tuple[int, ...],
+        z_dim: int,
+        sees_dense_reward: bool = False,
     ) -> None:
         """Build the network; whether it sees s' follows from the statistics' size."""
         super().__init__()
+        self.sees_dense_reward = sees_dense_reward
         self.obs_dim = obs_dim
         self.standardize = Standardize(*statistics)
         self.in_dim = len(statistics[0])

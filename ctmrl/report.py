@@ -54,13 +54,15 @@ def score(value: float, references: dict[str, float]) -> float | None:
 def result_table(record: dict[str, Any]) -> Table:
     """Returns and normalised scores of the method beside the references of the same tasks."""
     groups = ordered_groups(record)
-    table = Table(title=f"{record['env']}, {record['method']}, seed {record['seed']}")
+    table = Table(
+        title=f"{record['env']}, {record['method']}, seed {record['seed']}, last checkpoint"
+    )
     table.add_column("")
     for name, group in groups.items():
         count = len(group["tasks"])
         table.add_column(f"{TITLES[name]} ({count})\nreturn", justify="right")
         table.add_column("\nscore", justify="right")
-    rows = {f"{record['method']} (last checkpoint)": [g["return"] for g in groups.values()]}
+    rows = {record["method"]: [g["return"] for g in groups.values()]}
     for key, label in LABELS.items():
         values = [group["references"].get(key) for group in groups.values()]
         if any(value is not None for value in values):

@@ -130,7 +130,12 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
     settle_threads(config.threads)
     dataset = open_data(config)
     split = split_tasks(dataset, config.validate)
-    data = OfflineData(dataset, split.train, config.actor_critic.timeouts_as_terminals)
+    data = OfflineData(
+        dataset,
+        split.train,
+        config.actor_critic.timeouts_as_terminals,
+        config.context.dense_reward_in_context,
+    )
     learner = Learner(config, data)
     path = config.out or default_folder(config)
     settings = settings_of(config, dataset, split, learner)

@@ -20,6 +20,7 @@ from rich.console import Console
 
 from datagen.budgets import budget
 from datagen.card import rows_text
+from datagen.dataset import task_file
 from datagen.estimate import seconds_of
 from datagen.finished import (
     check_origin,
@@ -140,10 +141,10 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
         try:
             _run(jobs, plan.workers, display)
         except KeyboardInterrupt:
-            raise InterruptedCollectionError(display.finished, len(plan.tasks)) from None
+            raise InterruptedCollectionError(_done(plan), len(plan.tasks)) from None
         except WorkerError as error:
             raise CollectionError(
-                f"task {jobs[error.index].task}: {error}; {display.finished} of "
+                f"task {jobs[error.index].task}: {error}; {_done(plan)} of "
                 f"{len(plan.tasks)} tasks are done, and the same command continues"
             ) from None
         finally:
@@ -154,6 +155,11 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
         raise CollectionError(
             f"all tasks are done, but not the index ({error}); the same command continues"
         ) from error
+
+
+def _done(plan: Plan) -> int:
+    """Tasks with a file, also of a worker that was stopped before it could say so."""
+    return sum((plan.folder / task_file(task)).exists() for task in plan.tasks)
 
 
 def _prepare(folder: Path) -> None:

@@ -105,11 +105,6 @@ class CollectionDisplay:
         if self._progress:
             self._progress.stop()
 
-    @property
-    def finished(self) -> int:
-        """Tasks that are done, those found finished among them."""
-        return self._finished
-
     def started(self, task: int) -> None:
         """A worker has taken a task."""
         self._starts[task] = time.monotonic()

@@ -25,6 +25,9 @@ class MethodConfig:
     """Learning rate of the encoder and all that is trained with it, at the start."""
     next_obs_in_context: bool = True
     """Whether the encoder sees s' beside s, a and r."""
+    dense_reward_in_context: bool = False
+    """On a sparse environment, let contexts see the dense reward, in training and in the meta-test,
+    as some of the field's scripts do; scores stay sparse."""
 
 
 class Dimensions(NamedTuple):
@@ -58,7 +61,11 @@ class Method(nn.Module, ABC):
         super().__init__()
         self.dims = dims
         self.encoder = ContextEncoder(
-            statistics.context, dims.obs, config.encoder_hidden, config.z_dim
+            statistics.context,
+            dims.obs,
+            config.encoder_hidden,
+            config.z_dim,
+            config.dense_reward_in_context,
         )
 
     @abstractmethod

@@ -66,14 +66,14 @@ def test_the_result_table() -> None:
     table = result_table(record(seed=2))
     # The record's first group, `seen`, has -10, the second -11.
     assert cells(table) == {
-        "ctmrl (last checkpoint)": ["-11.00", "76.0", "-10.00", "80.0"],
+        "ctmrl": ["-11.00", "76.0", "-10.00", "80.0"],
         "oracle (exact optimum)": ["-5.00", "100.0", "-5.00", "100.0"],
         "best behaviour policy": ["-5.50", "98.0", "-5.50", "98.0"],
         "wind-blind controller": ["-6.00", "96.0", "-6.00", "96.0"],
         "random": ["-30.00", "0.0", "-30.00", "0.0"],
     }
     text = printed(table)
-    assert "point_robot_wind, ctmrl, seed 2" in text
+    assert "point_robot_wind, ctmrl, seed 2, last checkpoint" in text
     assert text.index("unseen tasks (5)") < text.index("seen tasks (5)", text.index("unseen") + 9)
 
 

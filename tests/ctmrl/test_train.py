@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -105,7 +106,7 @@ def test_what_a_run_shows(finished_run: FinishedRun) -> None:
     assert all("codes in use" in line and "return on training tasks" in line for line in progress)
     assert "unseen tasks (10)" in finished_run.output
     for group in record["groups"].values():
-        (row,) = [line for line in lines if "ctmrl (last checkpoint)" in line]
+        (row,) = [line for line in lines if re.match(r"\W+ctmrl\b", line)]
         assert f"{group['return']:.2f}" in row
         assert f"{group['score']:.1f}" in row
     assert lines[-1] == f"Pictures, metrics and checkpoint: {finished_run.path}"

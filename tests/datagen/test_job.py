@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sys
 from dataclasses import replace
 from importlib import metadata
@@ -71,6 +72,17 @@ def test_made_again_it_has_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     collect_task(replace(JOB, folder=tmp_path))
     same = [(path / "task_002.h5").read_bytes() for path in (folder, tmp_path)]
     assert same[0] == same[1]
+
+
+def test_a_full_disk_leaves_nothing(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            collect_task(replace(JOB, folder=tmp_path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_another_seed_or_task_has_other_rows(data: TaskData, tmp_path: Path) -> None:
