@@ -146,7 +146,7 @@ def _about(index: Mapping[str, Any]) -> list[str]:
         f"stochastic policy played {config['episodes']} episodes. The data are a mixture of poor, "
         "middling and good behaviour.",
         "",
-        "Made again, byte for byte, by",
+        "Made again by this command, byte for byte with the versions below on a like processor:",
         "",
         "```",
         remake_command(index),

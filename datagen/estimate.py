@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from datagen.budgets import Budget
 from datagen.plan import Plan
 from datagen.rollout import rollout
+from meta_envs.registry import definition
 
 MEASURED_SECONDS = 1.5
 """Seconds of learning a measurement takes, at least."""
@@ -50,7 +51,7 @@ def seconds_a_learning_step(env: str, budget: Budget) -> float:
     # The first updates are slow: memory is allocated and code is loaded.
     watch = _Stopwatch(random_steps + 2 * REPORT_EVERY)
     endless = dataclasses.replace(
-        budget, steps=10**6, random_steps=random_steps, checkpoints=(10**6,)
+        budget, steps=10**5, random_steps=random_steps, checkpoints=(10**5,)
     )
     with suppress(_EnoughError):
         train_policies(env, 0, endless, 0, watch.report)
@@ -62,8 +63,6 @@ def seconds_a_rollout(env: str, episodes: int) -> float:
 
     def still(obs: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         return zeros, zeros
-
-    from meta_envs.registry import definition
 
     zeros = np.zeros((episodes, *definition(env).action_space.shape), np.float32)
     begin = time.perf_counter()

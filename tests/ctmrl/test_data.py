@@ -173,6 +173,15 @@ def test_contexts_see_sparse_rewards_and_batches_dense_ones(sparse_path: Path) -
         np.testing.assert_allclose(context[:, 4], np.maximum(1 - distance / 0.2, 0), atol=1e-5)
 
 
+def test_contexts_see_dense_rewards_on_request(sparse_path: Path) -> None:
+    dataset = open_dataset(sparse_path)
+    data = OfflineData(dataset, dataset.train_tasks, dense_context=True)
+    context = data.contexts(torch.tensor([0]), 1, 4, 300, generator())[0, 0]
+    goal = dataset.params[dataset.tasks == dataset.train_tasks[0]][0]
+    distance = np.linalg.norm(context[:, -2:].numpy() - goal, axis=1)
+    np.testing.assert_allclose(context[:, 4], -distance, atol=1e-5)
+
+
 def test_the_test_tasks_files_are_never_read(wind_path: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(wind_path, tmp_path / "wind")
     dataset = open_dataset(folder)

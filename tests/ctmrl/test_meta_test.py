@@ -188,13 +188,19 @@ def test_contexts_are_of_all_explored_transitions_random_ones_first(
     assert given[1:][inside][..., :2].equal(given[:-1][inside][..., 5:])
 
 
-def test_contexts_see_the_environments_own_reward(encoder: CountingEncoder, actor: Actor) -> None:
+@pytest.mark.parametrize("dense", [False, True])
+def test_contexts_see_the_sparse_reward_unless_asked_otherwise(
+    encoder: CountingEncoder, actor: Actor, dense: bool
+) -> None:
     tasks = task_set("sparse_point_robot")
-    meta_test(encoder, actor, tasks, ROWS, PROTOCOL, SEED)
+    encoder.sees_dense_reward = dense
+    result = meta_test(encoder, actor, tasks, ROWS, PROTOCOL, SEED)
+    assert (result.returns >= 0).all()
     given = torch.stack(encoder.given)
     goals = torch.from_numpy(np.tile(tasks.params[ROWS], (2, 1))).float()
     distance = (given[..., 5:] - goals).norm(dim=-1)
-    torch.testing.assert_close(given[..., 4], (1 - distance / 0.2).clamp_min(0), atol=1e-5, rtol=0)
+    wanted = -distance if dense else (1 - distance / 0.2).clamp_min(0)
+    torch.testing.assert_close(given[..., 4], wanted, atol=1e-5, rtol=0)
 
 
 def test_without_exploration_the_context_is_0(encoder: CountingEncoder, actor: Actor) -> None:

@@ -100,6 +100,7 @@ def test_a_file_does_not_depend_on_what_else_ran(original: Path, tmp_path: Path)
     assert (tmp_path / "task_007.h5").read_bytes() == (original / "task_007.h5").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_shard_has_the_same_files(original: Path, tmp_path: Path) -> None:
     options = ["--shard", "1/2", "--workers", "1", "--out", str(tmp_path)]
     assert main([*ARGUMENTS, *options]) == 0
@@ -263,7 +264,7 @@ def test_a_full_disk_at_the_very_end(
 def workers_of(pid: int) -> list[int]:
     """Process ids of a collection's workers."""
     columns = ["-o", "pid=", "-o", "ppid=", "-o", "args="]
-    listing = subprocess.run(["ps", "-A", *columns], capture_output=True, text=True, check=True)
+    listing = subprocess.run(["ps", "-Aww", *columns], capture_output=True, text=True, check=True)
     rows = [line.split(maxsplit=2) for line in listing.stdout.splitlines()]
     return [int(row[0]) for row in rows if int(row[1]) == pid and "spawn_main" in row[2]]
 
