@@ -140,7 +140,7 @@ def main() -> int:
         errors.print("Interrupted; nothing was written.")
         return 130
     table = Table("environment", title=f"Collection, budget {options.budget}, one thread")
-    for heading in ("learning step, ms", "checkpoint, ms", "task, s", "task measured, s"):
+    for heading in ("step, ms", "checkpoint, ms", "task, s", "measured, s"):
         table.add_column(heading, justify="right")
     for one in results:
         times = (one.milliseconds_a_learning_step, one.milliseconds_a_checkpoint)

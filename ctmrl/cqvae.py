@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 EPSILON = 1e-6
-"""Added to norms, so that a zero vector has cosine 0 with everything and not NaN."""
+"""Least norm a vector is divided by, so that a zero vector has cosine 0 and not NaN."""
 
 
 def cosine(a: Tensor, b: Tensor) -> Tensor:

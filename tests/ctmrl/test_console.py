@@ -102,6 +102,9 @@ def test_the_live_table() -> None:
         assert key == "step" or f"{value:.4f}" in text
     # The last measured return stays in sight.
     assert text.rindex("-12.3450") > text.index("67%")
+    # And 0 is a return, too.
+    later = shown([ROW, {**ROW, "step": 40, "return/training_tasks": 0.0}], terminal=True)
+    assert later.rindex("0.0000") > later.rfind("-12.3450")
 
 
 def test_the_live_table_ends_with_an_error() -> None:

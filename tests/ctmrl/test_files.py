@@ -18,6 +18,15 @@ def test_a_file_is_written_and_replaced(tmp_path: Path) -> None:
         assert os.listdir(tmp_path) == ["x.json"]
 
 
+def test_who_reads_the_old_file_meanwhile_is_not_disturbed(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"old")
+    with path.open("rb") as reader:
+        write_whole(path, b"new and longer")
+        assert reader.read() == b"old"
+    assert path.read_bytes() == b"new and longer"
+
+
 def test_what_an_earlier_kill_left_is_no_obstacle(tmp_path: Path) -> None:
     (tmp_path / ".x.partial").write_bytes(b"half of a much longer file")
     write_whole(tmp_path / "x", b"new")

@@ -44,6 +44,8 @@ def actor() -> Actor:
     with torch.no_grad():
         # Far apart for different contexts, so that every context matters.
         next(made.parameters()).mul_(3.0)
+        # And to the right, over the edge where the noisy robot's episodes end.
+        list(made.parameters())[-1][0] += 0.3
     return made
 
 
@@ -57,6 +59,7 @@ class Adaptation:
         self.noise = np.random.default_rng(SEED)
         self.generator = torch.Generator().manual_seed(SEED)
         self.transitions: list[list[Tensor]] = [[] for _ in rows]
+        self.scored_steps = [0] * len(rows)
         for number, env in enumerate(self.envs):
             env.reset(seed=SEED + number)
 
@@ -94,6 +97,7 @@ class Adaptation:
                 age[k] += 1
                 if running[k]:
                     returns[k] += reward
+                    self.scored_steps[k] += kind == "score"
                     if kind != "score":
                         row = np.concatenate([obs[k], action[k], [np.float32(reward)], after])
                         self.transitions[k].append(torch.from_numpy(row).float())
@@ -106,8 +110,8 @@ class Adaptation:
 @torch.no_grad()
 def by_single_environments(
     encoder: ContextEncoder, actor: Actor, tasks: TaskSet, protocol: MetaTestConfig
-) -> tuple[MetaTestResult, list[int]]:
-    """The result, and the number of transitions behind each context."""
+) -> tuple[MetaTestResult, list[int], list[int]]:
+    """The result, and how many steps each environment explored and was scored."""
     rows = [int(task) for _ in range(protocol.repetitions) for task in ROWS]
     run = Adaptation(encoder, actor, tasks, rows)
     kinds = ["random"] * protocol.random_episodes + ["policy"] * protocol.policy_episodes
@@ -123,7 +127,7 @@ def by_single_environments(
         np.array([*curve, final]).reshape(-1, *shape).mean(axis=1),
         run.contexts().reshape(*shape, Z).numpy(),
     )
-    return result, [len(seen) for seen in run.transitions]
+    return result, [len(seen) for seen in run.transitions], run.scored_steps
 
 
 @pytest.fixture(params=["point_robot_wind", "sparse_point_robot", "noisy_robot"])
@@ -144,7 +148,7 @@ def test_the_protocol(
 ) -> None:
     protocol = dataclasses.replace(PROTOCOL, **change)
     found = meta_test(encoder, actor, tasks, ROWS, protocol, SEED)
-    wanted, counts = by_single_environments(encoder, actor, tasks, protocol)
+    wanted, counts, scored = by_single_environments(encoder, actor, tasks, protocol)
     episodes = protocol.random_episodes + protocol.policy_episodes
     assert found.returns.shape == (protocol.repetitions, 3)
     assert found.curve.shape == (episodes + 1, 3)
@@ -155,7 +159,9 @@ def test_the_protocol(
     assert np.abs(found.contexts).max(axis=-1).min() > 1e-3
     assert len({round(value, 4) for value in found.curve[:, 0]}) > 1 or tasks.env.startswith("spa")
     if tasks.env == "noisy_robot":
+        # Some are over while others still run.
         assert change or len(set(counts)) > 1
+        assert len(set(scored)) > 1
     else:
         assert set(counts) == {episodes * ENVIRONMENTS[tasks.env].horizon}
 

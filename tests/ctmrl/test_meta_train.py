@@ -184,34 +184,46 @@ def test_a_state_is_tensors_and_a_foreign_one_is_refused(wind_data: OfflineData)
         learner.load(wrong)
 
 
-def test_rates_fall_linearly_to_a_hundredth(wind_data: OfflineData) -> None:
-    learner = Learner(config_of(brac=True), wind_data)
-    start = [
-        (group, group["lr"])
+def rates(learner: Learner) -> dict[str, float]:
+    """The learning rate of each trained parameter, by name."""
+    by_parameter = {
+        id(parameter): group["lr"]
         for optimizer in learner.optimizers.values()
         for group in optimizer.param_groups
-    ]
-    assert {rate for _, rate in start} == learner_rates(config_of(brac=True))
+        for parameter in group["params"]
+    }
+    named = modules(learner).named_parameters()
+    return {name: by_parameter[id(p)] for name, p in named if p.requires_grad}
+
+
+def with_rates(config: RunConfig) -> RunConfig:
+    """Three rates that differ."""
+    return dataclasses.replace(
+        config,
+        context=dataclasses.replace(config.context, encoder_lr=2e-3),
+        actor_critic=dataclasses.replace(config.actor_critic, learning_rate=3e-3, dual_lr=5e-3),
+    )
+
+
+def test_each_network_has_its_rate_and_rates_fall_linearly(wind_data: OfflineData) -> None:
+    learner = Learner(with_rates(config_of(brac=True)), wind_data)
+    start = rates(learner)
+    for name, rate in start.items():
+        wanted = 2e-3 if name.startswith("method.") else 3e-3
+        assert rate == (5e-3 if "dual_critic" in name else wanted), name
     for step in range(STEPS):
         learner.update()
         share = 1.0 - 0.99 * step / STEPS
-        for group, rate in start:
-            assert group["lr"] == pytest.approx(rate * share, rel=1e-9)
+        for name, rate in rates(learner).items():
+            assert rate == pytest.approx(start[name] * share, rel=1e-9)
     assert LAST_RATE == 0.01
 
 
-def learner_rates(config: RunConfig) -> set[float]:
-    ac = config.actor_critic
-    return {config.context.encoder_lr, ac.learning_rate, ac.dual_lr}
-
-
 def test_without_decay_rates_stay(wind_data: OfflineData) -> None:
-    learner = Learner(config_of(brac=True, decay=False), wind_data)
+    learner = Learner(with_rates(config_of(brac=True, decay=False)), wind_data)
+    start = rates(learner)
     train(learner, 5)
-    found = {
-        group["lr"] for optimizer in learner.optimizers.values() for group in optimizer.param_groups
-    }
-    assert found == learner_rates(config_of(brac=True))
+    assert rates(learner) == start
 
 
 def test_a_step_draws_different_tasks_and_their_contexts_belong_to_their_rows(

@@ -96,6 +96,10 @@ def test_the_interval_is_of_the_mean() -> None:
     assert low == pytest.approx(values.mean() - 1.96 * error, abs=0.25 * error)
     assert high == pytest.approx(values.mean() + 1.96 * error, abs=0.25 * error)
     assert interval(values) == (low, high)
+    # Percentiles of resampled means, which are not symmetric for values that are not.
+    skewed = np.array([1.0, 1.1, 1.2, 1.3, 9.0])
+    draws = np.random.default_rng(1).choice(skewed, (20_000, 5)).mean(axis=1)
+    assert interval(skewed) == pytest.approx(np.percentile(draws, [2.5, 97.5]), abs=0.1)
     assert interval(np.full(7, -6.0)) == (-6.0, -6.0)
     assert all(math.isnan(bound) for bound in interval(values[:1]))
 
