@@ -220,7 +220,7 @@ def _columns_table(index: Mapping[str, Any]) -> list[str]:
         "",
         'dataset = open_dataset("path/to/this/folder")',
         "data = dataset.read(int(dataset.train_tasks[0]))",
-        "print(data.observations.shape, data.meta['params'])",
+        'print(data.observations.shape, data.meta["params"])',
         "```",
         "",
     ]
