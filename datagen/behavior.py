@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.sac.policies import Actor
 
 from datagen.budgets import Budget
@@ -123,5 +124,7 @@ def train_policies(
         seed=seed,
         device="cpu",
     )
+    # Without a logger of its own, each model would leave a folder among the temporary files.
+    model.set_logger(Logger(folder=None, output_formats=[]))
     model.learn(budget.steps, callback=keep, log_interval=budget.steps)
     return keep.policies
