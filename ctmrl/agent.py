@@ -48,8 +48,10 @@ def load_agent(config: RunConfig, dims: Dimensions, state: dict[str, torch.Tenso
         RuntimeError: the checkpoint does not fit the settings.
     """
     statistics = empty_statistics(dims, config.context.next_obs_in_context)
-    method = build_method(config, statistics, dims)
-    actor = Actor(statistics.obs, config.context.z_dim, config.actor_critic.hidden, dims.act)
+    # Initial weights are drawn from torch's global generator, though none of them stays.
+    with torch.random.fork_rng():
+        method = build_method(config, statistics, dims)
+        actor = Actor(statistics.obs, config.context.z_dim, config.actor_critic.hidden, dims.act)
     method.load_state_dict(part(state, "method/"))
     actor.load_state_dict(part(state, "actor_critic/actor."))
     return Agent(method, actor)

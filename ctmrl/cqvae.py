@@ -46,19 +46,19 @@ def moving_update(codes: Tensor, contexts: Tensor, matched: Tensor, eta: float) 
     return torch.where(counts[:, None] > 0, (1 - eta) * codes + eta * means, codes)
 
 
-def code_contrast_loss(contexts: Tensor, codes: Tensor, tau: float) -> Tensor:
+def code_contrast_loss(contexts: Tensor, codes: Tensor, matched: Tensor, tau: float) -> Tensor:
     """Equation (3), L_C: minus the sum over tasks of the matched code's log softmax of cos / tau.
 
     Args:
         contexts: [B, Z].
         codes: [N, Z].
+        matched: int64 [B], from `match`.
         tau: temperature.
 
     Returns:
         Scalar, a sum over the B tasks as printed.
     """
-    logits = cosine(contexts, codes) / tau
-    return functional.cross_entropy(logits, logits.argmax(dim=1), reduction="sum")
+    return functional.cross_entropy(cosine(contexts, codes) / tau, matched, reduction="sum")
 
 
 def reward_prediction_loss(predicted: Tensor, reward: Tensor) -> Tensor:

@@ -113,11 +113,11 @@ def main(config: EvaluateConfig) -> None:
     from ctmrl.agent import load_agent
     from ctmrl.config import check_settings
     from ctmrl.errors import UsageError
-    from ctmrl.files import write_whole
     from ctmrl.methods.base import Dimensions
     from ctmrl.presets import config_from_settings
     from ctmrl.report import result_table, write_pictures
     from ctmrl.threads import settle_threads
+    from datagen.dataset import write_whole
     from meta_envs import task_set
 
     stored = runs.read_json(config.run / runs.CONFIG)
@@ -126,6 +126,8 @@ def main(config: EvaluateConfig) -> None:
         protocol = dataclasses.replace(run_config.meta_test, repetitions=config.repetitions)
         run_config = dataclasses.replace(run_config, meta_test=protocol)
     seed = run_config.seed if config.seed is None else config.seed
+    if config.out is not None and config.out.resolve() == config.run.resolve():
+        raise UsageError(f"--out {config.out} is the run itself: choose another folder")
     if config.fresh < 0:
         raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
     with runs.fitting(config.run / runs.CONFIG):

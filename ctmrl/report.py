@@ -17,8 +17,8 @@ import tyro
 from numpy.typing import NDArray
 from rich.table import Table
 
-from ctmrl.files import write_whole
 from ctmrl.summary import Result, collate, find_records, interquartile_mean, interval, to_csv
+from datagen.dataset import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

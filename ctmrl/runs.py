@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ctmrl.errors import UsageError
-from ctmrl.files import write_whole
+from datagen.dataset import write_whole
 
 CONFIG, METRICS, CHECKPOINT, EVALUATION = (
     "config.json",
@@ -137,6 +137,10 @@ class RunFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RunError(f"another process is at work in {self.path}: wait for it") from None
+        # The lock is ours, so whatever others were writing here will never be finished.
+        for left in self.path.glob(".*.partial"):
+            if f".{os.getpid()}." not in left.name:
+                left.unlink()
         config = self.path / CONFIG
         if restart and config.exists():
             self._throw_away()
@@ -152,7 +156,7 @@ class RunFolder:
         os.close(self._lock)
 
     def _entries(self) -> set[str]:
-        """Names of all that is there, but for files that were never finished."""
+        """Names of all that is there, but for what this process is writing."""
         names = (entry.name for entry in self.path.iterdir())
         return {name for name in names if not name.endswith(".partial")}
 
@@ -222,6 +226,8 @@ class RunFolder:
             if new:
                 writer.writeheader()
             writer.writerow(row)
+            file.flush()
+            os.fsync(file.fileno())
 
     def write_json(self, name: str, content: object) -> None:
         """Write a JSON file of the run."""

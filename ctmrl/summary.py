@@ -56,13 +56,22 @@ def find_records(paths: list[Path]) -> list[dict[str, Any]]:
         try:
             record = json.loads(file.read_bytes())
             record["run"] = str(file.parent)
-            record["groups"], record["env"], record["method"], record["seed"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            _check(record)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UsageError(
                 f"{file} is not an evaluation of a run ({error}): move it away"
             ) from None
         records.append(record)
     return records
+
+
+def _check(record: dict[str, Any]) -> None:
+    """Raise a KeyError, TypeError or ValueError unless it has all that `collate` uses."""
+    int(record["seed"]), str(record["env"]), str(record["method"])
+    for group in record["groups"].values():
+        float(group["return"]), list(group["tasks"]), dict(group["references"])
+        if group["score"] is not None:
+            float(group["score"])
 
 
 def collate(records: list[dict[str, Any]]) -> list[Result]:

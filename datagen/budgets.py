@@ -134,6 +134,21 @@ BUDGETS: dict[str, dict[str, Budget]] = {
 """Budgets by the environment's short name and the budget's name."""
 
 
+def other_episodes(env: str, name: str, episodes: int) -> list[str]:
+    """The option for episodes that are not the budget's own, as words of a command, or none.
+
+    Args:
+        env: any of the environment's names.
+        name: of the budget.
+        episodes: episodes of each checkpoint.
+
+    Raises:
+        ValueError: there is no such environment or budget.
+    """
+    own = budget(env, name).episodes
+    return [] if episodes == own else ["--episodes", str(episodes)]
+
+
 def budget(env: str, name: str, episodes: int | None = None) -> Budget:
     """Find a budget.
 

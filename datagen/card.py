@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from datagen.budgets import budget
+from datagen.budgets import other_episodes
 from datagen.columns import COLUMNS
 from meta_envs import resolve, task_set
 from meta_envs.registry import definition
@@ -45,9 +45,7 @@ def remake_command(index: Mapping[str, Any]) -> str:
         index: content of `dataset.json`.
     """
     words = ["python", "-m", "datagen.collect", "--env", index["env"], "--budget", index["budget"]]
-    episodes = index["config"]["episodes"]
-    if budget(index["env"], index["budget"]).episodes != episodes:
-        words += ["--episodes", str(episodes)]
+    words += other_episodes(index["env"], index["budget"], index["config"]["episodes"])
     tasks = [record["task"] for record in index["tasks"]]
     if len(tasks) < len(task_set(index["env"])):
         words += ["--tasks", rows_text(tasks)]

@@ -48,6 +48,7 @@ __all__ = [
     "task_of",
     "write_index",
     "write_task",
+    "write_whole",
 ]
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from datagen.budgets import other_episodes
 from meta_envs import resolve
 
 INDEX_FILE = "dataset.json"
@@ -59,7 +60,8 @@ def collect_command(folder: Path, source: Mapping[str, Any], task: int | None = 
     Args:
         folder: the dataset's folder.
         source: an index or a task's `meta`, as far as known; its `env`, `budget` and `seed` are
-            used. Without a known `env` the folder's name is.
+            used, and its episodes where they are not the budget's own. Without a known `env` the
+            folder's name is.
         task: the one task to collect; all by default.
     """
     env = _short_name(source.get("env")) or _short_name(folder.absolute().name) or "ENVIRONMENT"
@@ -69,7 +71,16 @@ def collect_command(folder: Path, source: Mapping[str, Any], task: int | None = 
     for key in ("budget", "seed"):
         if isinstance(source.get(key), str | int):
             words += [f"--{key}", str(source[key])]
+    words += _thinning(env, source)
     return shlex.join([*words, "--out", str(folder)])
+
+
+def _thinning(env: str, source: Mapping[str, Any]) -> list[str]:
+    """The option that repeats other episodes than the budget's, where both are known."""
+    try:
+        return other_episodes(env, source["budget"], int(source["config"]["episodes"]))
+    except (KeyError, TypeError, ValueError):
+        return []
 
 
 def _short_name(name: object) -> str | None:

@@ -111,7 +111,7 @@ class CTMRL(Method):
                 )
             if config.code_contrast:
                 losses["code_contrast"] = (
-                    cqvae.code_contrast_loss(anchors, codes, config.tau) / tasks
+                    cqvae.code_contrast_loss(anchors, codes, matched, config.tau) / tasks
                 )
         spe, cro = self._prediction(contexts[0], anchors, matched)
         losses["spe_prediction"] = spe / n

@@ -42,7 +42,7 @@ class Commands:
             text=True,
             env={**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"},
         )
-        self._child = 0
+        self.child = 0
 
     def __enter__(self) -> Commands:
         """Itself."""
@@ -58,11 +58,11 @@ class Commands:
         request = {"words": words, "folder": str(self.folder), "log": str(self.log)}
         self._server.stdin.write(json.dumps(request) + "\n")
         self._server.stdin.flush()
-        self._child = self._answer()
+        self.child = self._answer()
 
     def send(self, number: signal.Signals) -> None:
         """Send the command a signal."""
-        os.kill(self._child, number)
+        os.kill(self.child, number)
 
     def wait(self) -> int:
         """Wait for the command; its exit code, minus the signal's number if one ended it."""

@@ -24,7 +24,9 @@ def test_an_agent_is_the_learners(method: str, next_obs: bool, wind_data: Offlin
     config = dataclasses.replace(config, context=context)
     learner = Learner(config, wind_data)
     learner.update()
+    before = torch.random.get_rng_state()
     agent = load_agent(config, learner.method.dims, learner.state())
+    assert torch.random.get_rng_state().equal(before)
     for found, wanted in zip(
         (agent.method, agent.actor), (learner.agent.method, learner.agent.actor), strict=True
     ):

@@ -95,15 +95,29 @@ def test_equation_2_takes_the_mean_of_a_codes_contexts_in_any_order() -> None:
 
 def test_equation_3_against_a_loop() -> None:
     contexts, codes = normal(BATCH, Z), normal(CODES, Z, seed=1)
+    matched = cqvae.match(contexts, codes)
     total = 0.0
     for context in contexts.tolist():
         terms = [math.exp(cosine(context, code) / TAU) for code in codes.tolist()]
         total -= math.log(terms[nearest(context, codes.tolist())] / sum(terms))
-    assert cqvae.code_contrast_loss(contexts, codes, TAU).item() == pytest.approx(total, rel=1e-10)
+    loss = cqvae.code_contrast_loss(contexts, codes, matched, TAU)
+    assert loss.item() == pytest.approx(total, rel=1e-10)
+
+
+def test_equation_3_keeps_the_match_it_is_given() -> None:
+    contexts, codes = normal(BATCH, Z), normal(CODES, Z, seed=1)
+    other = (cqvae.match(contexts, codes) + 1) % CODES
+    total = 0.0
+    for context, code in zip(contexts.tolist(), other.tolist(), strict=True):
+        terms = [math.exp(cosine(context, one) / TAU) for one in codes.tolist()]
+        total -= math.log(terms[code] / sum(terms))
+    loss = cqvae.code_contrast_loss(contexts, codes, other, TAU)
+    assert loss.item() == pytest.approx(total, rel=1e-10)
 
 
 def test_equation_3_with_a_single_code_is_0() -> None:
-    assert cqvae.code_contrast_loss(normal(BATCH, Z), normal(1, Z), TAU).item() == 0.0
+    matched = torch.zeros(BATCH, dtype=torch.int64)
+    assert cqvae.code_contrast_loss(normal(BATCH, Z), normal(1, Z), matched, TAU).item() == 0.0
 
 
 @pytest.mark.parametrize(
@@ -239,7 +253,7 @@ def test_zero_vectors_give_no_nan(zero: str) -> None:
         tensor.requires_grad_()
     matched = cqvae.match(contexts.detach(), codes.detach())
     negatives = cqvae.hard_negatives(matched, 3, generator())
-    loss = cqvae.code_contrast_loss(contexts, codes, TAU) + cqvae.hard_contrast_loss(
+    loss = cqvae.code_contrast_loss(contexts, codes, matched, TAU) + cqvae.hard_contrast_loss(
         contexts, positives, matched, negatives, TAU, CODES
     )
     gradients = torch.autograd.grad(loss, (contexts, codes, positives))

@@ -226,3 +226,11 @@ def test_an_output_folder_that_is_a_file(
     )
     assert run_command(lambda: main(command)) == 2
     assert capsys.readouterr().err.startswith("error: [Errno 17] File exists: ")
+
+
+def test_the_runs_own_folder_as_output(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(copy)
+    out = copy / ".." / copy.name
+    said = f"--out {out} is the run itself: choose another folder"
+    assert mistake(capsys, copy, out=out, fresh=1) == said
+    assert contents(copy) == before

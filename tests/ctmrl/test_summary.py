@@ -44,7 +44,18 @@ def test_no_record_is_one_sentence(tmp_path: Path) -> None:
         find_records([tmp_path / "a", tmp_path / "b"])
 
 
-@pytest.mark.parametrize("content", [[], 3, {}, {"groups": {}, "env": "x", "method": "y"}])
+NOT_RECORDS: list[object] = [
+    [],
+    3,
+    {},
+    {"groups": {}, "env": "x", "method": "y"},
+    record() | {"seed": "first"},
+    record() | {"groups": []},
+    *({**record(), "groups": {"unseen": {"return": value}}} for value in (None, 1.0)),
+]
+
+
+@pytest.mark.parametrize("content", NOT_RECORDS)
 def test_a_foreign_record_is_one_sentence(content: object, tmp_path: Path) -> None:
     folder = write(tmp_path / "x", content)
     with pytest.raises(UsageError, match=r"evaluation.json is not an evaluation of a run"):

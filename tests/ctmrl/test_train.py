@@ -153,13 +153,14 @@ def test_an_interrupted_and_twice_killed_run_ends_in_the_same_bytes(
     assert commands.output().splitlines()[0] == f"Going on at step {reached} of 40."
     assert int(load_checkpoint(path / "checkpoint.pt")["step"]) < 40
     # A pipe that nobody reads holds the command up between the first and the second picture.
-    os.mkfifo(path / ".contexts.png.partial")
     commands.start(*words)
+    pipe = path / f".contexts.png.{commands.child}.partial"
+    os.mkfifo(pipe)
     wait_until((path / "adaptation.png").exists)
     commands.send(signal.SIGKILL)
     assert commands.wait() == -signal.SIGKILL
     assert not (path / "evaluation.json").exists()
-    (path / ".contexts.png.partial").unlink()
+    assert pipe.exists()
     assert commands.run(*words) == 0, commands.output()
     assert commands.output().splitlines()[0] == "Going on at step 40 of 40."
     assert contents(path) == contents(finished_run.path)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,6 +49,12 @@ def test_a_policy_is_the_actors_distribution(policies: list[Policy]) -> None:
     assert mean.dtype == log_std.dtype == np.float32
     predicted = policies[-1].actor(torch.as_tensor(obs), deterministic=True).detach().numpy()
     np.testing.assert_allclose(np.tanh(mean), predicted, atol=1e-6)
+
+
+def test_no_temporary_file_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    train_policies("point_robot_wind", 0, SMOKE, seed=0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_progress_is_reported() -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from datagen.budgets import budget
 from datagen.files import (
     DatasetError,
     canonical_json,
@@ -152,6 +153,14 @@ def test_the_remedy_is_a_command_that_shells_understand() -> None:
     assert " ".join(head) == (
         "python -m datagen.collect --env point_robot_wind --tasks 7 --budget smoke --seed 3 --out"
     )
+    thinned = collect_command(folder, {"budget": "smoke", "seed": 3, "config": {"episodes": 7}})
+    assert "--seed 3 --episodes 7 --out" in thinned
+    own = {
+        "budget": "smoke",
+        "seed": 3,
+        "config": {"episodes": budget("point_robot", "smoke").episodes},
+    }
+    assert "--episodes" not in collect_command(folder, own)
     assert "--env sparse_point_robot " in collect_command(folder, {"env": "sparse_point_robot"})
     assert "--env point_robot_wind " in collect_command(folder, {"env": "; rm", "seed": [1]})
     assert "--env ENVIRONMENT " in collect_command(Path("x"), {"env": None})

@@ -122,7 +122,8 @@ def test_l_c_trains_encoder_and_codes() -> None:
     value, gradients = of_a_term(method, "code_contrast")
     assert trained(gradients) == {"encoder", "codebook"}
     _, anchors, _, codes = parts(method)
-    wanted = cqvae.code_contrast_loss(anchors, codes, method.config.tau) / BATCH
+    matched = cqvae.match(anchors, method.codebook.codes)
+    wanted = cqvae.code_contrast_loss(anchors, codes, matched, method.config.tau) / BATCH
     assert value == pytest.approx(0.7 * wanted.item(), rel=1e-6)
     assert_gradients(gradients, wanted, method, codes, 0.7)
 
