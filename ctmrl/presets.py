@@ -16,12 +16,16 @@ from meta_envs import ENVIRONMENTS
 CODES = {"point_robot": 8, "point_robot_wind": 8, "sparse_point_robot": 4}
 """Codes of the paper's headline results, by environment."""
 PAPER_CONTEXT_SIZE = {"point_robot": 1024, "point_robot_wind": 256, "sparse_point_robot": 1024}
-STANDARD_TRAINING: dict[str, dict[str, Any]] = {
-    "point_robot": {},
-    "point_robot_wind": {},
-    "sparse_point_robot": {},
+# Random actions stay near the origin, where rewards differ little from goal to goal: only a larger
+# encoder on longer contexts learns to tell the goal from them.
+GOAL_TRAINING = {"steps": 12_000, "context_episodes": 3, "context_size": 60}
+GOAL_CONTEXT = {"encoder_hidden": (200, 200, 200), "predictor_hidden": (128, 128)}
+STANDARD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "point_robot": (GOAL_TRAINING, GOAL_CONTEXT),
+    "point_robot_wind": ({}, {}),
+    "sparse_point_robot": (GOAL_TRAINING, GOAL_CONTEXT),
 }
-"""Where an environment's standard training differs from the defaults of MetaTrainConfig."""
+"""Where an environment's standard training and context differ from the defaults."""
 PAPER_CONTEXT = {
     "z_dim": 20,
     "encoder_hidden": (200, 200, 200),
@@ -62,9 +66,10 @@ def preset(env: str, method: str, name: Preset, **changes: Any) -> RunConfig:
     """
     if env not in CODES:
         raise UsageError(f"no preset for '{env}' (there are: {', '.join(CODES)})")
-    training = MetaTrainConfig(**STANDARD_TRAINING[env])
+    standard_training, standard_context = STANDARD[env]
+    training = MetaTrainConfig(**standard_training)
     actor_critic, meta_test = ActorCriticConfig(), MetaTestConfig()
-    context: dict[str, Any] = {"codes": CODES[env]}
+    context: dict[str, Any] = {"codes": CODES[env], **standard_context}
     if name == "paper":
         context |= PAPER_CONTEXT
         size = PAPER_CONTEXT_SIZE[env]
