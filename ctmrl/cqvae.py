@@ -61,14 +61,20 @@ def code_contrast_loss(contexts: Tensor, codes: Tensor, matched: Tensor, tau: fl
     return functional.cross_entropy(cosine(contexts, codes) / tau, matched, reduction="sum")
 
 
-def reward_prediction_loss(predicted: Tensor, reward: Tensor) -> Tensor:
-    """Equations (4) and (7), L_r: sum over t of the norms of the error, [*, T, 1] -> [*]."""
-    return _norms(predicted - reward).sum(dim=-1)
+def reward_prediction_loss(predicted: Tensor, reward: Tensor, squared: bool = False) -> Tensor:
+    """Equations (4) and (7), L_r: sum over t of the norms of the error, [*, T, 1] -> [*].
+
+    With `squared`, of their squares, as the released code has it.
+    """
+    return _norms(predicted - reward, squared).sum(dim=-1)
 
 
-def state_prediction_loss(predicted: Tensor, next_obs: Tensor) -> Tensor:
-    """Equations (5) and (8), L_s: sum over t of the norms of the error, [*, T, O] -> [*]."""
-    return _norms(predicted - next_obs).sum(dim=-1)
+def state_prediction_loss(predicted: Tensor, next_obs: Tensor, squared: bool = False) -> Tensor:
+    """Equations (5) and (8), L_s: sum over t of the norms of the error, [*, T, O] -> [*].
+
+    With `squared`, of their squares, as the released code has it.
+    """
+    return _norms(predicted - next_obs, squared).sum(dim=-1)
 
 
 def prediction_loss(reward_loss: Tensor, state_loss: Tensor) -> Tensor:
@@ -76,9 +82,10 @@ def prediction_loss(reward_loss: Tensor, state_loss: Tensor) -> Tensor:
     return reward_loss + state_loss
 
 
-def _norms(error: Tensor) -> Tensor:
+def _norms(error: Tensor, squared: bool) -> Tensor:
+    squares = error.square().sum(dim=-1)
     # A norm's gradient at exactly zero error is NaN without the small term.
-    return (error.square().sum(dim=-1) + 1e-12).sqrt()
+    return squares if squared else (squares + 1e-12).sqrt()
 
 
 def hard_contrast_loss(

@@ -18,12 +18,15 @@ CODES = {"point_robot": 8, "point_robot_wind": 8, "sparse_point_robot": 4}
 PAPER_CONTEXT_SIZE = {"point_robot": 1024, "point_robot_wind": 256, "sparse_point_robot": 1024}
 # Random actions stay near the origin, where rewards differ little from goal to goal: only a larger
 # encoder on longer contexts learns to tell the goal from them.
-GOAL_TRAINING = {"steps": 12_000, "context_episodes": 3, "context_size": 60}
-GOAL_CONTEXT = {"encoder_hidden": (200, 200, 200), "predictor_hidden": (128, 128)}
+GOAL_TRAINING: dict[str, Any] = {"steps": 12_000, "context_episodes": 3, "context_size": 60}
+GOAL_CONTEXT: dict[str, Any] = {"encoder_hidden": (200, 200, 200), "predictor_hidden": (128, 128)}
 STANDARD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "point_robot": (GOAL_TRAINING, GOAL_CONTEXT),
     "point_robot_wind": ({}, {}),
-    "sparse_point_robot": (GOAL_TRAINING, GOAL_CONTEXT),
+    "sparse_point_robot": (
+        GOAL_TRAINING | {"steps": 6_000},
+        GOAL_CONTEXT | {"squared_errors": True},
+    ),
 }
 """Where an environment's standard training and context differ from the defaults."""
 PAPER_CONTEXT = {

@@ -50,6 +50,9 @@ class CTMRLConfig(MethodConfig):
     """Weight of L_contra."""
     metric_weight: float = 0.0
     """Weight of FOCAL's metric loss, which the released code adds (10) and the paper lacks."""
+    squared_errors: bool = False
+    """Square the norms of equations (4), (5), (7) and (8), as the released code does. The norm of a
+    reward's error is least at its median, which is 0 where rewards are rare."""
     predictor_hidden: tuple[int, ...] = (64, 64)
     """Widths of the predictors' hidden layers."""
 
@@ -139,15 +142,15 @@ class CTMRL(Method):
             # The value is the code's; the gradient reaches both the code and the context, whose
             # matching to the code has none of its own.
             used.append(self.codebook.codes[matched] + z - z.detach())
-        n = context.shape[1]
+        n, squared = context.shape[1], self.config.squared_errors
         conditions = torch.stack(used)[:, :, None].expand(-1, -1, n, -1)
         many = len(used)
         predicted = self.predictors(
             obs.expand(many, *obs.shape), action.expand(many, *action.shape), conditions
         )
         per_task = cqvae.prediction_loss(
-            cqvae.reward_prediction_loss(predicted[0], targets[0]),
-            cqvae.state_prediction_loss(predicted[1], targets[1]),
+            cqvae.reward_prediction_loss(predicted[0], targets[0], squared),
+            cqvae.state_prediction_loss(predicted[1], targets[1], squared),
         )
         means = per_task.mean(dim=1)
         return means[0], means[1] if many == 2 else torch.zeros(())

@@ -120,22 +120,23 @@ def test_equation_3_with_a_single_code_is_0() -> None:
     assert cqvae.code_contrast_loss(normal(BATCH, Z), normal(1, Z), matched, TAU).item() == 0.0
 
 
+@pytest.mark.parametrize("squared", [False, True])
 @pytest.mark.parametrize(
     ("loss", "width"),
     [(cqvae.reward_prediction_loss, 1), (cqvae.state_prediction_loss, OBS)],
     ids=["4 and 7", "5 and 8"],
 )
 def test_prediction_equations_sum_norms_over_time(
-    loss: Callable[[Tensor, Tensor], Tensor], width: int
+    loss: Callable[[Tensor, Tensor, bool], Tensor], width: int, squared: bool
 ) -> None:
     predicted, target = normal(BATCH, LENGTH, width), normal(BATCH, LENGTH, width, seed=1)
-    found = loss(predicted, target)
+    found = loss(predicted, target, squared)
     assert found.shape == (BATCH,)
     for i in range(BATCH):
         total = 0.0
         for t in range(LENGTH):
             squares = [(predicted[i, t, k] - target[i, t, k]).item() ** 2 for k in range(width)]
-            total += math.sqrt(sum(squares))
+            total += sum(squares) if squared else math.sqrt(sum(squares))
         assert found[i].item() == pytest.approx(total, rel=1e-9)
 
 
@@ -144,10 +145,11 @@ def test_equations_6_and_9_weigh_reward_and_state_equally() -> None:
     assert found.tolist() == [11.0, 22.0, 43.0]
 
 
-def test_a_perfect_prediction_has_no_loss_and_a_gradient() -> None:
+@pytest.mark.parametrize("squared", [False, True])
+def test_a_perfect_prediction_has_no_loss_and_a_gradient(squared: bool) -> None:
     target = normal(BATCH, LENGTH, OBS)
     predicted = target.clone().requires_grad_()
-    loss = cqvae.state_prediction_loss(predicted, target).sum()
+    loss = cqvae.state_prediction_loss(predicted, target, squared).sum()
     (gradient,) = torch.autograd.grad(loss, predicted)
     assert loss.item() == pytest.approx(0.0, abs=1e-3)
     assert gradient.isfinite().all()

@@ -89,8 +89,9 @@ def predictions(method: CTMRL, h: Tensor, z: Tensor) -> Tensor:
     for i in range(BATCH):
         got_reward, got_change = method.predictors(obs[i], action[i], z[i].expand(LENGTH, Z))
         for t in range(LENGTH):
-            total = total + (got_reward[t] - wanted_reward[i, t]).norm()
-            total = total + (got_change[t] - wanted_change[i, t]).norm()
+            errors = got_reward[t] - wanted_reward[i, t], got_change[t] - wanted_change[i, t]
+            for error in errors:
+                total = total + error.norm() ** (2 if method.config.squared_errors else 1)
     return total / BATCH / LENGTH
 
 
@@ -107,8 +108,9 @@ def assert_gradients(
         torch.testing.assert_close(found[name], expected, rtol=1e-6, atol=1e-9, msg=name)
 
 
-def test_l_pre_spe_trains_encoder_and_predictors_but_not_the_codes() -> None:
-    method = placed()
+@pytest.mark.parametrize("squared", [False, True])
+def test_l_pre_spe_trains_encoder_and_predictors_but_not_the_codes(squared: bool) -> None:
+    method = with_switches(placed(), squared_errors=squared)
     value, gradients = loss_and_gradients(with_switches(method, **OFF))
     assert trained(gradients) == {"encoder", "predictors"}
     h, anchors, _, codes = parts(method)
