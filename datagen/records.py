@@ -132,7 +132,8 @@ def _check_returns(returns: Mapping[str, Any], task: int) -> None:
             raise ValueError(f"task {task} has no number '{key}' among its returns")
     for key in ("behavior", "deterministic"):
         values = returns.get(key)
-        if not isinstance(values, Mapping) or not all(map(_is_number, values.values())):
+        numbers = isinstance(values, Mapping) and all(map(_is_number, values.values()))
+        if not numbers or not values:
             raise ValueError(f"task {task} has no object of numbers '{key}' among its returns")
 
 

@@ -64,6 +64,7 @@ META: list[tuple[Edit, str]] = [
     (put("returns", "expert", float("nan")), "has no number 'expert'"),
     (put("returns", "behavior", [1.0]), "has no object of numbers 'behavior'"),
     (put("returns", "deterministic", "200", "high"), "no object of numbers 'deterministic'"),
+    (put("returns", "deterministic", {}), "no object of numbers 'deterministic'"),
 ]
 
 INDEX: list[tuple[Edit, str]] = [
