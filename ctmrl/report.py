@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from ctmrl.summary import Result, collate, find_records, interquartile_mean, interval, to_csv
-from datagen.dataset import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,6 +78,8 @@ def result_table(record: dict[str, Any]) -> Table:
 
 def write_pictures(record: dict[str, Any], folder: Path) -> None:
     """Write adaptation.png and contexts.png into a folder."""
+    from datagen.dataset import write_whole
+
     for name, draw in (("adaptation.png", adaptation_figure), ("contexts.png", context_figure)):
         buffer = BytesIO()
         # Without a version in it, so that equal results give equal bytes.
@@ -242,6 +243,8 @@ def main(config: ReportConfig) -> None:
             console.print(f"{result.method}, seed by seed: {values}", soft_wrap=True)
     if config.csv is not None:
         config.csv.parent.mkdir(parents=True, exist_ok=True)
+        from datagen.dataset import write_whole
+
         write_whole(config.csv, to_csv(results).encode())
 
 
