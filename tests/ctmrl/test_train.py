@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import io
@@ -180,7 +181,9 @@ def test_runs_killed_at_20_random_moments_end_in_the_same_bytes(
         words = (*finished_run.words, "--out", str(path))
         commands.start(*words)
         time.sleep(length * (number + draw.random()) / 20)
-        commands.send(signal.SIGKILL)
+        # The last ones may have ended by themselves, if the machine has become quicker.
+        with contextlib.suppress(ProcessLookupError):
+            commands.send(signal.SIGKILL)
         killed += commands.wait() == -signal.SIGKILL
         had_checkpoint += (path / "checkpoint.pt").exists()
         assert commands.run(*words) == 0, commands.output()
