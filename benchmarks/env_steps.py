@@ -1,4 +1,4 @@
-r"""Environment steps a second: the native vector environments beside Gymnasium's SyncVectorEnv.
+r"""Environment steps a second: the native point robots beside Gymnasium's SyncVectorEnv.
 
     python benchmarks/env_steps.py --repetitions 11 --seconds 0.15 \
         --out benchmarks/results/env_steps.csv
@@ -15,6 +15,7 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from meta_envs import ENVIRONMENTS, resolve
+from meta_envs import resolve
 
 PRERECORDED = 64
 """Number of action batches that take turns, so that drawing them is not timed."""
@@ -37,7 +38,7 @@ PRERECORDED = 64
 class Benchmark:
     """Measure environment steps a second, native vector environment against SyncVectorEnv."""
 
-    envs: tuple[str, ...] = tuple(ENVIRONMENTS)
+    envs: tuple[str, ...] = ("point_robot", "point_robot_wind", "sparse_point_robot")
     """Environments to measure."""
     num_envs: int = 100
     """Sub-environments side by side."""
@@ -121,8 +122,15 @@ def machine() -> dict[str, str]:
     }
 
 
-def _write(path: Path, results: list[Result]) -> None:
-    rows = [{**vars(result), **machine()} for result in results]
+def write_results(path: Path, results: Sequence[object], more: Mapping[str, str]) -> None:
+    """Write a CSV file with a row for each record, whole or not at all.
+
+    Args:
+        path: of the file.
+        results: records of one dataclass; their fields are columns.
+        more: what else the figures were taken on, beside what `machine` says.
+    """
+    rows = [{**vars(result), **machine(), **more} for result in results]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -170,7 +178,7 @@ def main() -> int:
         )
     console.print(table)
     if options.out is not None:
-        _write(options.out, results)
+        write_results(options.out, results, {})
         console.print(f"Wrote {options.out}")
     return 0
 

@@ -5,29 +5,26 @@ After `import meta_envs`, `gymnasium.make("PointRobotWind-v0", task=3)` makes ta
 makes one sub-environment a task.
 """
 
-import gymnasium
-
+from meta_envs.definition import Definition
 from meta_envs.env import MetaEnv, MetaVectorEnv
-from meta_envs.registry import ENVIRONMENTS, resolve, task_set
+from meta_envs.registry import ENVIRONMENTS, Row, register, resolve, task_set
 from meta_envs.scores import normalized_score, reference_returns
-from meta_envs.tasks import TaskSet
+from meta_envs.tasks import Split, TaskSet
 
 __all__ = [
     "ENVIRONMENTS",
+    "Definition",
     "MetaEnv",
     "MetaVectorEnv",
+    "Row",
+    "Split",
     "TaskSet",
     "normalized_score",
     "reference_returns",
+    "register",
     "resolve",
     "task_set",
 ]
 
 for _row in ENVIRONMENTS.values():
-    gymnasium.register(
-        id=_row.id,
-        entry_point="meta_envs.env:MetaEnv",
-        vector_entry_point="meta_envs.env:MetaVectorEnv",
-        max_episode_steps=_row.horizon,
-        kwargs={"name": _row.name},
-    )
+    register(_row)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -15,6 +15,27 @@ from meta_envs.tasks import TaskSet
 Floats = NDArray[np.float64]
 Terms = dict[str, NDArray[Any]]
 Controller = Callable[[Floats, Floats], Floats]
+
+
+class Simulation(ABC):
+    """Moves the states of one shell's sub-environments on; every shell has one of its own.
+
+    What `step` returns depends on its arguments and on the tasks alone, never on earlier calls.
+    """
+
+    @abstractmethod
+    def set_params(self, params: Floats) -> None:
+        """Put sub-environment i on the task of row i, params [n, P]."""
+
+    @abstractmethod
+    def step(self, state: Floats, action: Floats, rows: NDArray[np.bool_] | None = None) -> Floats:
+        """Next states, a fresh array [n, S].
+
+        Args:
+            state: states [n, S].
+            action: actions [n, A] in [-1, 1].
+            rows: bool [n], whose next state is wanted; all by default. The others' are finite.
+        """
 
 
 class Definition(ABC):
@@ -35,6 +56,14 @@ class Definition(ABC):
     """Reference controllers, (states, params) -> actions; `oracle` is the exact optimum."""
     sparse: ClassVar[bool] = False
     """True if `reward` is sparse and its terms hold the `dense_reward` learners may use."""
+    render_fps: int = 10
+    """Pictures a second at which an episode looks natural."""
+    random_episodes: ClassVar[int] = 1000
+    """Episodes a task behind the random policy's return, unless a caller says otherwise."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Itself: copies of an environment share it, for it holds nothing of an episode."""
+        return self
 
     @abstractmethod
     def tasks(self) -> TaskSet:
@@ -47,6 +76,15 @@ class Definition(ABC):
     @abstractmethod
     def advance(self, state: Floats, action: Floats, params: Floats) -> Floats:
         """Next states [n, S]."""
+
+    def simulation(self, num_envs: int, threads: int = 1) -> Simulation:
+        """What moves the states of one shell on; here `advance`, without threads.
+
+        Args:
+            num_envs: number of sub-environments.
+            threads: native threads that share them, where the environment can use any.
+        """
+        return _Advancing(self)
 
     @abstractmethod
     def observe(self, state: Floats) -> NDArray[np.float32]:
@@ -68,3 +106,16 @@ class Definition(ABC):
     @abstractmethod
     def render(self, path: Floats, params: Floats) -> NDArray[np.uint8]:
         """Picture [height, width, 3] of one episode so far: its states [t, S], its task [P]."""
+
+
+class _Advancing(Simulation):
+    """Calls `advance` with the parameters it was given."""
+
+    def __init__(self, definition: Definition) -> None:
+        self._advance = definition.advance
+
+    def set_params(self, params: Floats) -> None:
+        self._params = params
+
+    def step(self, state: Floats, action: Floats, rows: NDArray[np.bool_] | None = None) -> Floats:
+        return self._advance(state, action, self._params)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from typing import Any, ClassVar
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,15 +14,27 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from meta_envs import checks
-from meta_envs.definition import Floats, Terms
+from meta_envs.definition import Definition, Floats, Terms
 from meta_envs.registry import definition, resolve, task_set
 from meta_envs.streams import Streams
 from meta_envs.tasks import TaskSet
 
-RENDER_FPS = 10
+OwnTasks = Mapping[str, float] | Sequence[Mapping[str, float]]
+"""Parameters of a task by their names, or of several tasks."""
 
 
-def _tasks_of(name: str, tasks: TaskSet | None) -> TaskSet:
+def _processors() -> int:
+    """Number of processors this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _tasks_of(name: str, tasks: TaskSet | None, own: OwnTasks | None) -> TaskSet:
+    if own is not None:
+        if tasks is not None:
+            raise ValueError("give task_set or task_params, not both")
+        return task_set(name).with_params(own)
     return task_set(name) if tasks is None else checks.check_task_set(name, tasks)
 
 
@@ -32,10 +45,9 @@ class MetaEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     the reward's terms. The task is never in the observation. Actions are clipped to [-1, 1].
     """
 
-    # The base class declares it as an instance's, yet it is the class's there too.
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+    metadata: dict[str, Any] = {  # noqa: RUF012 - every instance has its own
         "render_modes": ["rgb_array"],
-        "render_fps": RENDER_FPS,
+        "render_fps": Definition.render_fps,
     }
 
     def __init__(
@@ -44,6 +56,7 @@ class MetaEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         task: int = 0,
         task_set: TaskSet | None = None,
         render_mode: str | None = None,
+        task_params: Mapping[str, float] | None = None,
     ) -> None:
         """Build the environment.
 
@@ -53,29 +66,36 @@ class MetaEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             task_set: tasks to draw from instead of the environment's own, such as fresh ones
                 from `TaskSet.sample`.
             render_mode: "rgb_array" or None.
+            task_params: a task of one's own instead, a number for each of the parameters.
 
         Raises:
-            ValueError: unknown name, task out of range, foreign task set, unknown render mode.
+            ValueError: unknown name, task out of range, foreign task set, wrong task_params,
+                unknown render mode.
+            ImportError: the environment needs MuJoCo, or a newer one.
         """
         self.definition = definition(name)
-        self.task_set = _tasks_of(self.definition.name, task_set)
+        self.task_set = _tasks_of(self.definition.name, task_set, task_params)
         # Copies, because a space holds the generator its samples come from.
         self.observation_space = copy.deepcopy(self.definition.observation_space)
         self.action_space = copy.deepcopy(self.definition.action_space)
         self.render_mode = checks.check_render_mode(render_mode)
+        self.metadata = {**MetaEnv.metadata, "render_fps": self.definition.render_fps}
         self._shape = self.definition.action_space.shape
         self._state: Floats | None = None
         self._path: list[Floats] = []
-        self._set_task(task)
+        row = self.task_set.check_task(task)
+        self._simulation = self.definition.simulation(1)
+        self._set_task(row)
 
     @property
     def task(self) -> int:
         """Row of the task set this environment is on."""
         return self._task
 
-    def _set_task(self, task: object) -> None:
-        self._task = self.task_set.check_task(task)
-        self._params = self.task_set.params[self._task : self._task + 1]
+    def _set_task(self, task: int) -> None:
+        self._task = task
+        self._params = self.task_set.params[task : task + 1]
+        self._simulation.set_params(self._params)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -97,7 +117,7 @@ class MetaEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         actions = checks.check_action(action, self._shape)[None]
         state = self._state
-        self._state = self.definition.advance(state, actions, self._params)
+        self._state = self._simulation.step(state, actions)
         reward, terms = self.definition.reward(state, actions, self._state, self._params)
         terminated = bool(self.definition.terminated(self._state)[0])
         if self.render_mode:
@@ -133,6 +153,8 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        threads: int | None = None,
+        task_params: OwnTasks | None = None,
     ) -> None:
         """Build the sub-environments.
 
@@ -148,13 +170,21 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
                 are in `info["final_obs"]` and `info["final_info"]`), "Disabled" leaves it to
                 `reset(options={"reset_mask": mask})`.
             render_mode: "rgb_array" or None.
+            threads: native threads that step the sub-environments, where the environment can use
+                any; by default as many as there are processors for this process. More than
+                sub-environments are never used. The numbers do not depend on it.
+            task_params: tasks of one's own instead of a set: a number for each of the parameters,
+                or a sequence of such mappings, then one sub-environment each.
 
         Raises:
             ValueError: any argument out of range, each named.
+            ImportError: the environment needs MuJoCo, or a newer one.
         """
         row = resolve(name)
         self.definition = definition(row.name)
-        self.task_set = _tasks_of(row.name, task_set)
+        self.task_set = _tasks_of(row.name, task_set, task_params)
+        if tasks is None and isinstance(task_params, Sequence):
+            tasks = range(len(task_params))
         count = checks.check_positive("num_envs", num_envs)
         self._tasks = checks.check_rows([task] * count if tasks is None else tasks, self.task_set)
         self.num_envs = len(self._tasks)
@@ -164,14 +194,21 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         self.horizon = checks.check_positive("max_episode_steps", limit)
         self.autoreset_mode = checks.check_autoreset_mode(autoreset_mode)
         self.render_mode = checks.check_render_mode(render_mode)
-        self.metadata = {**MetaEnv.metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {
+            **MetaEnv.metadata,
+            "render_fps": self.definition.render_fps,
+            "autoreset_mode": self.autoreset_mode,
+        }
         # Copies, because a space holds the generator its samples come from.
         self.single_observation_space = copy.deepcopy(self.definition.observation_space)
         self.single_action_space = copy.deepcopy(self.definition.action_space)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._shape = (self.num_envs, *self.definition.action_space.shape)
-        self._params = self._params_of(self._tasks)
+        wanted = _processors() if threads is None else checks.check_positive("threads", threads)
+        self.threads = min(wanted, self.num_envs)
+        self._simulation = self.definition.simulation(self.num_envs, self.threads)
+        self._set_params()
         self._streams = Streams([None] * self.num_envs)
         self._state: Floats | None = None
         self._every = np.ones(self.num_envs, dtype=np.bool_)
@@ -182,10 +219,10 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         self._first_deadline = 0
         self._paths: list[list[Floats]] = [[] for _ in range(self.num_envs)]
 
-    def _params_of(self, tasks: NDArray[np.int64]) -> Floats:
-        params = self.task_set.params[tasks]
-        params.setflags(write=False)
-        return params
+    def _set_params(self) -> None:
+        self._params: Floats = self.task_set.params[self._tasks]
+        self._params.setflags(write=False)
+        self._simulation.set_params(self._params)
 
     @property
     def tasks(self) -> NDArray[np.int64]:
@@ -232,7 +269,7 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         tasks = self._asked_tasks(checked["task"]) if "task" in checked else self._tasks
         seeds = None if seed is None else checks.check_seeds(seed, self.num_envs)
         self._tasks = np.where(mask, tasks, self._tasks)
-        self._params = self._params_of(self._tasks)
+        self._set_params()
         if seeds is not None:
             for index in np.flatnonzero(mask).tolist():
                 self._streams.reseed(index, seeds[index])
@@ -264,7 +301,8 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
                 f"sub-environments {np.flatnonzero(self._over).tolist()} are over: call "
                 "reset(options={'reset_mask': mask}) first, or choose another autoreset_mode"
             )
-        next_state = self.definition.advance(state, checked, self._params)
+        going = ~self._over if self._any_over else None
+        next_state = self._simulation.step(state, checked, going)
         reward, terms = self.definition.reward(state, checked, next_state, self._params)
         terminated = self.definition.terminated(next_state)
         self._state = next_state

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
+import gymnasium
+
 if TYPE_CHECKING:
     from meta_envs.definition import Definition
     from meta_envs.tasks import TaskSet
@@ -61,8 +63,124 @@ ENVIRONMENTS: dict[str, Row] = {
             20,
             "goal on the unit half circle; reward only near it",
         ),
+        Row(
+            "half_cheetah_vel",
+            "HalfCheetahVel-v0",
+            "half-cheetah-vel",
+            "meta_envs.half_cheetah:HalfCheetahVel",
+            200,
+            "target velocity, 1 to 3 m/s",
+        ),
+        Row(
+            "hopper_params",
+            "HopperRandParams-v0",
+            "hopper-rand-params",
+            "meta_envs.rand_params:HopperRandParams",
+            200,
+            "masses, inertias, damping, friction",
+        ),
+        Row(
+            "walker_params",
+            "WalkerRandParams-v0",
+            "walker-rand-params",
+            "meta_envs.rand_params:WalkerRandParams",
+            200,
+            "masses, inertias, damping, friction",
+        ),
+        Row(
+            "ant_goal",
+            "AntGoal-v0",
+            "ant-goal",
+            "meta_envs.ant:AntGoal",
+            200,
+            "goal on a circle of radius 2 m",
+        ),
+        Row(
+            "half_cheetah_dir",
+            "HalfCheetahDir-v0",
+            "half-cheetah-dir",
+            "meta_envs.half_cheetah:HalfCheetahDir",
+            200,
+            "direction: backwards or forwards",
+        ),
+        Row(
+            "ant_dir",
+            "AntDir-v0",
+            "ant-dir",
+            "meta_envs.ant:AntDir",
+            200,
+            "direction, all around",
+        ),
+        Row(
+            "humanoid_dir",
+            "HumanoidDir-v0",
+            "humanoid-dir",
+            "meta_envs.humanoid:HumanoidDir",
+            200,
+            "direction, all around",
+        ),
+        Row(
+            "hopper_mass",
+            "HopperMass-v0",
+            "hopper-mass",
+            "meta_envs.scaled_params:HopperMass",
+            200,
+            "one multiplier of masses and inertias",
+        ),
+        Row(
+            "hopper_friction",
+            "HopperFriction-v0",
+            "hopper-friction",
+            "meta_envs.scaled_params:HopperFriction",
+            200,
+            "one multiplier of all friction",
+        ),
+        Row(
+            "walker_mass",
+            "WalkerMass-v0",
+            "walker-mass",
+            "meta_envs.scaled_params:WalkerMass",
+            200,
+            "one multiplier of masses and inertias",
+        ),
+        Row(
+            "walker_friction",
+            "WalkerFriction-v0",
+            "walker-friction",
+            "meta_envs.scaled_params:WalkerFriction",
+            200,
+            "one multiplier of all friction",
+        ),
     )
 }
+
+
+def register(row: Row) -> None:
+    """Make an environment known to Gymnasium and by its short name, your own too.
+
+    Args:
+        row: what to call it and where its Definition is.
+
+    Raises:
+        ValueError: another environment has its name or its id.
+    """
+    if ENVIRONMENTS.get(row.name, row) is not row or row.id in gymnasium.registry:
+        raise ValueError(f"there is an environment '{row.name}' or {row.id} already")
+    ENVIRONMENTS[row.name] = row
+    gymnasium.register(
+        id=row.id,
+        entry_point="meta_envs.env:MetaEnv",
+        vector_entry_point="meta_envs.env:MetaVectorEnv",
+        max_episode_steps=row.horizon,
+        kwargs={"name": row.name},
+    )
+
+
+def unregister(row: Row) -> None:
+    """Take back `register`, and forget what was made of the Definition."""
+    del ENVIRONMENTS[row.name], gymnasium.registry[row.id]
+    _definition.cache_clear()
+    _task_set.cache_clear()
 
 
 def resolve(name: str) -> Row:
@@ -79,7 +197,7 @@ def resolve(name: str) -> Row:
     }
     if wanted in spellings:
         return spellings[wanted]
-    near = difflib.get_close_matches(wanted, spellings, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(wanted, spellings, n=1, cutoff=0.6)
     hint = f"; did you mean '{spellings[near[0]].name}'?" if near else ""
     raise ValueError(f"no environment '{name}'{hint} (known: {', '.join(ENVIRONMENTS)})")
 

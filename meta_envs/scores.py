@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from meta_envs.definition import Controller, Floats
+from meta_envs.definition import Controller, Definition, Floats
 from meta_envs.env import MetaVectorEnv
+from meta_envs.registry import definition
 from meta_envs.tasks import TaskSet
 
-RANDOM_EPISODES = 1000
-"""Episodes a task behind the random policy's return."""
+RANDOM_EPISODES = Definition.random_episodes
+"""Episodes a task behind the random policy's return, where the environment does not differ."""
 
 
 def _episode_returns(env: MetaVectorEnv, controller: Controller) -> Floats:
@@ -26,18 +27,19 @@ def _episode_returns(env: MetaVectorEnv, controller: Controller) -> Floats:
 
 
 def reference_returns(
-    tasks: TaskSet, episodes: int = RANDOM_EPISODES, seed: int = 0
+    tasks: TaskSet, episodes: int | None = None, seed: int = 0
 ) -> dict[str, Floats]:
     """Undiscounted returns of the reference controllers on exactly these tasks.
 
     Args:
         tasks: any task set, the environment's own, a part of it or fresh tasks.
-        episodes: episodes a task of the random policy.
+        episodes: episodes a task of the random policy; the environment's own number by default.
         seed: of the random policy's private generator.
 
     Returns:
         `random` (uniform actions, mean of `episodes`) and one entry for each controller of the
-        environment, such as `oracle` (the exact optimum); each float64 [n_tasks].
+        environment, such as `oracle` (the exact optimum, where one is known) or `still` (no
+        action, one episode); each float64 [n_tasks].
     """
     rows = np.arange(len(tasks))
     generator = np.random.default_rng(seed)
@@ -45,6 +47,8 @@ def reference_returns(
     def uniform(state: Floats, params: Floats) -> Floats:
         return generator.uniform(-1.0, 1.0, shape)
 
+    if episodes is None:
+        episodes = definition(tasks.env).random_episodes
     many = MetaVectorEnv(tasks.env, tasks=np.repeat(rows, episodes), task_set=tasks)
     shape = (many.num_envs, *many.definition.action_space.shape)
     found = {"random": _episode_returns(many, uniform).reshape(len(tasks), episodes).mean(axis=1)}

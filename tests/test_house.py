@@ -20,7 +20,8 @@ MAX_LINES = 400
 COMMAND_LINE = {"tyro", "rich"}
 MAY_IMPORT: dict[str, set[str]] = {
     "meta_envs": {"meta_envs", "gymnasium", "mujoco", "numpy", "PIL"},
-    "meta_envs.__main__": {"meta_envs", "numpy", "PIL", *COMMAND_LINE},
+    "meta_envs.__main__": {"meta_envs", *COMMAND_LINE},
+    "meta_envs.commands": {"meta_envs", "numpy", "PIL", *COMMAND_LINE},
     "datagen": {
         "datagen", "meta_envs", "gymnasium", "h5py", "matplotlib", "numpy", "PIL",
         "stable_baselines3", "torch", *COMMAND_LINE,

@@ -17,13 +17,14 @@ from ctmrl.methods.base import Dimensions
 from ctmrl.methods.ctmrl import CTMRLConfig
 from ctmrl.presets import config_from_settings, known_preset, preset
 from ctmrl.runs import to_json
-from meta_envs import ENVIRONMENTS, task_set
+from meta_envs import task_set
+from tests.meta_envs.robots import POINT_ROBOTS
 
 NAMES = get_args(Preset)
 PATH = Path("run") / "config.json"
 
 
-@pytest.fixture(params=[(e, m, n) for e in ENVIRONMENTS for m in METHODS for n in NAMES], ids=str)
+@pytest.fixture(params=[(e, m, n) for e in POINT_ROBOTS for m in METHODS for n in NAMES], ids=str)
 def config(request: pytest.FixtureRequest) -> RunConfig:
     """Every preset in turn."""
     return preset(*request.param)
@@ -62,7 +63,7 @@ def test_changed_settings_come_back() -> None:
 
 def test_the_papers_sizes() -> None:
     codes, sizes = {}, {}
-    for env in ENVIRONMENTS:
+    for env in POINT_ROBOTS:
         config = preset(env, "ctmrl", "paper")
         assert isinstance(config.context, CTMRLConfig)
         codes[env], sizes[env] = config.context.codes, config.training.context_size

@@ -10,6 +10,7 @@ from datagen.columns import check_columns
 from datagen.rollout import Columns, Floats32, episode_returns, join, rollout
 from meta_envs import ENVIRONMENTS, task_set
 from tests.meta_envs.noisy_robot import EDGE, ROW
+from tests.meta_envs.robots import POINT_ROBOTS
 
 EPISODES = 7
 
@@ -30,7 +31,7 @@ def distances(columns: Columns, goal: NDArray[np.float64]) -> NDArray[np.float64
     return np.asarray(np.hypot(x, y))
 
 
-@pytest.mark.parametrize("env", ENVIRONMENTS)
+@pytest.mark.parametrize("env", POINT_ROBOTS)
 def test_columns_keep_the_formats_promises(env: str) -> None:
     columns = roll(env)
     check_columns(columns, 2, 2, env.startswith("sparse"))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from meta_envs.definition import Floats
@@ -21,6 +22,11 @@ class NoisyRobot(PointRobot):
 
     name: ClassVar[str] = "noisy_robot"
     horizon: ClassVar[int] = 9
+
+    def __init__(self) -> None:
+        super().__init__()
+        # It may start a tenth nearer to the edge than the origin is.
+        self.observation_space = Box(-1.1, 1.1, (2,), np.float32)
 
     def tasks(self) -> TaskSet:
         goals = np.random.default_rng(5).uniform(-1.0, 1.0, (12, 2))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from meta_envs import ENVIRONMENTS, MetaEnv, MetaVectorEnv, TaskSet, reference_returns, task_set
 from meta_envs.definition import Controller
 from meta_envs.registry import definition
+from tests.meta_envs.robots import POINT_ROBOTS
 
 Floats = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ def hand_step(
     return x, y, -distance, distance
 
 
-@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize("name", POINT_ROBOTS)
 def test_every_step_is_the_hand_written_one(name: str) -> None:
     generator = np.random.default_rng(1)
     successes = 0
@@ -174,7 +175,7 @@ def oracle_sequence(name: str, start: Floats, task: int, steps: int) -> Floats:
     return np.stack(actions, axis=1)
 
 
-@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize("name", POINT_ROBOTS)
 def test_no_sequence_on_a_grid_beats_the_optimum(name: str) -> None:
     grid = np.array(list(itertools.product(np.linspace(-1.0, 1.0, 5), repeat=2)))
     three = np.array(list(itertools.product(grid, repeat=3)))
@@ -192,7 +193,7 @@ def test_no_sequence_on_a_grid_beats_the_optimum(name: str) -> None:
             assert rivals.max() > best - 0.25 * (5 if made.sparse else 1)
 
 
-@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize("name", POINT_ROBOTS)
 def test_no_perturbation_improves_the_optimum(name: str) -> None:
     generator = np.random.default_rng(3)
     steps = ENVIRONMENTS[name].horizon

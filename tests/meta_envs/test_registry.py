@@ -1,11 +1,13 @@
 import subprocess
 import sys
+from dataclasses import replace
+from typing import Any
 
 import gymnasium
 import pytest
 
-from meta_envs import ENVIRONMENTS, MetaEnv, MetaVectorEnv, resolve, task_set
-from meta_envs.registry import definition
+from meta_envs import ENVIRONMENTS, MetaEnv, MetaVectorEnv, register, resolve, task_set
+from meta_envs.registry import definition, unregister
 
 
 @pytest.mark.parametrize(
@@ -60,20 +62,68 @@ def test_a_row_agrees_with_its_definition_and_with_gymnasium(name: str) -> None:
     row, made, spec = ENVIRONMENTS[name], definition(name), gymnasium.spec(ENVIRONMENTS[name].id)
     assert (row.name, row.horizon) == (made.name, made.horizon)
     assert spec.max_episode_steps == row.horizon
-    assert row.alias == name.replace("_", "-")
+    camel = "".join(word.capitalize() for word in row.alias.split("-"))
+    assert row.id == f"{camel}-v0"
     assert task_set(name).env == name
-    assert "oracle" in made.controllers
-    assert isinstance(gymnasium.make(row.id).unwrapped, MetaEnv)
+    env: Any = gymnasium.make(row.id).unwrapped
+    assert isinstance(env, MetaEnv)
+    assert env.metadata["render_fps"] == made.render_fps
     vector = gymnasium.make_vec(row.id, num_envs=2, vectorization_mode="vector_entry_point")
     assert isinstance(vector, MetaVectorEnv)
     assert vector.horizon == row.horizon
 
 
-def test_importing_the_package_imports_no_definition() -> None:
+def test_nothing_is_imported_before_it_is_needed() -> None:
+    """No definition by importing the package, no MuJoCo by looking at an environment's tasks."""
     code = (
-        "import sys, meta_envs; meta_envs.resolve('point_robot'); "
-        "assert 'meta_envs.point_robot' not in sys.modules; "
-        "meta_envs.task_set('point_robot'); "
-        "assert 'meta_envs.point_robot' in sys.modules"
+        "import sys, meta_envs\n"
+        "from meta_envs.registry import definition\n"
+        "heavy = {'torch', 'mujoco', 'matplotlib', 'PIL', 'stable_baselines3', 'h5py', 'scipy'}\n"
+        "meta_envs.resolve('point_robot')\n"
+        "assert 'meta_envs.point_robot' not in sys.modules\n"
+        "meta_envs.task_set('point_robot')\n"
+        "assert 'meta_envs.point_robot' in sys.modules\n"
+        "for name in meta_envs.ENVIRONMENTS:\n"
+        "    meta_envs.task_set(name).hash, definition(name).observation_space\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "meta_envs.MetaEnv('half_cheetah_dir')\n"
+        "assert 'mujoco' in sys.modules\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_fields_names_are_known() -> None:
+    names = {
+        "half-cheetah-vel": "half_cheetah_vel",
+        "hopper-rand-params": "hopper_params",
+        "HopperRandParams-v0": "hopper_params",
+        "walker-rand-params": "walker_params",
+        "WalkerRandParams": "walker_params",
+        "ant-goal": "ant_goal",
+        "humanoid-dir": "humanoid_dir",
+    }
+    assert {spelling: resolve(spelling).name for spelling in names} == names
+
+
+def test_an_environment_of_ones_own_is_like_the_others() -> None:
+    row = replace(ENVIRONMENTS["point_robot"], name="own_robot", id="OwnRobot-v0", alias="own")
+    register(row)
+    try:
+        assert resolve("own") is ENVIRONMENTS["own_robot"] is row
+        assert gymnasium.spec("OwnRobot-v0").max_episode_steps == row.horizon
+        with pytest.raises(ValueError, match="there is an environment 'own_robot' or OwnRobot-v0"):
+            register(row)
+    finally:
+        unregister(row)
+    assert "own_robot" not in ENVIRONMENTS
+    assert "OwnRobot-v0" not in gymnasium.registry
+
+
+@pytest.mark.parametrize("taken", [{"name": "point_robot"}, {"id": "PointRobotWind-v0"}])
+def test_a_name_that_is_taken_is_refused_and_nothing_changes(taken: dict[str, Any]) -> None:
+    before, known = dict(ENVIRONMENTS), set(gymnasium.registry)
+    own = replace(ENVIRONMENTS["point_robot"], name="own_robot", id="OwnRobot-v0")
+    with pytest.raises(ValueError, match="there is an environment"):
+        register(replace(own, **taken))
+    assert before == ENVIRONMENTS
+    assert known == set(gymnasium.registry)

@@ -1,15 +1,37 @@
+import copy
+import pickle
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from meta_envs import ENVIRONMENTS, TaskSet, task_set
-from meta_envs.tasks import interleaved_test_tasks
+from meta_envs.tasks import Split, interleaved_test_tasks
 
 HASHES = {
     "point_robot": "a453fb994692f0a756485fcec53bae8ba243d66d66be0a9d3443f9cbe442d95f",
     "point_robot_wind": "2e79028263fb6b24a66cd0b617c615571729c5499bd64028f02a126d500ed175",
     "sparse_point_robot": "1134ae62df38d047da872383a7076ee53a8aa34e34d33800db1445f73dbf6958",
+    "half_cheetah_vel": "db153c0cc6a9e90497d72f7415b3757aed46924dc6e454418711937c329313e6",
+    "hopper_params": "3d12c5dd927873b719b5c36e1fa1b8b90e1c193da9c054b9209d4fde8d13ba6f",
+    "walker_params": "76a92fe4cbfdd4f8edbfb2e6a1b5d6863b45ca44c29e1a81fff1f55fc8bf1f26",
+    "ant_goal": "35a9e4f284bb3b9f6f350b9e64b25650c662dfc31cb889301e14ee815bc504a2",
+    "half_cheetah_dir": "afd31fc45aabc5ba593c6f37dba35d8966b85eb0592c63c65b685a55d274c808",
+    "ant_dir": "2820747fc72f38f369e5b3738ae4caaa78cf036d04cf83ea05024644b8d0bbcc",
+    "humanoid_dir": "b5c4667b1d1e2119fe6600bf6e97accc66855da8f96f97aa58ababf3044e095b",
+    "hopper_mass": "29a23042443931bf7da25847124de13fd506a47a6a32dd8e9988a6eda4883724",
+    "hopper_friction": "b28b094a0427504c72fa31adf51432ae4ba854dbad2bf6a239d0b725a0bc1200",
+    "walker_mass": "b2b86d0eb2edb4e296f76a8a413e1dac3c87413b259560cfee4c10563eae57bc",
+    "walker_friction": "cdafcd4f89b0d9ed6fbf2de30647564d54138aa8015a5df6869cb30899fd4c65",
 }
+SIZES = {"point_robot_wind": (40, 10), "half_cheetah_dir": (2, 2)}
+SIZES |= dict.fromkeys(("point_robot", "sparse_point_robot", "half_cheetah_vel"), (80, 20))
+"""Training and test tasks of the default split, where they are not 30 and 10."""
+
+
+def uniform(generator: np.random.Generator, n_tasks: int) -> NDArray[np.float64]:
+    return generator.uniform(size=(n_tasks, 2))
 
 
 def small_set(**changes: object) -> TaskSet:
@@ -18,7 +40,7 @@ def small_set(**changes: object) -> TaskSet:
         "param_names": ("a", "b"),
         "params": np.arange(6.0).reshape(3, 2),
         "test_tasks": np.array([1]),
-        "sampler": lambda generator, n_tasks: generator.uniform(size=(n_tasks, 2)),
+        "sampler": uniform,
     }
     return TaskSet(**{**content, **changes})  # type: ignore[arg-type]  # wrong types are the test
 
@@ -77,10 +99,11 @@ def test_the_hash_sees_every_part() -> None:
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_train_and_test_tasks_share_nothing_and_are_everything(name: str) -> None:
     tasks = task_set(name)
-    assert not set(tasks.train_tasks) & set(tasks.test_tasks)
-    assert sorted([*tasks.train_tasks, *tasks.test_tasks]) == list(range(len(tasks)))
-    expected = (40, 10) if name == "point_robot_wind" else (80, 20)
-    assert (len(tasks.train_tasks), len(tasks.test_tasks)) == expected
+    assert (len(tasks.train_tasks), len(tasks.test_tasks)) == SIZES.get(name, (30, 10))
+    assert set(tasks.train_tasks) | set(tasks.test_tasks) == set(range(len(tasks)))
+    # Of two directions, both are for training and for the test.
+    shared = {0, 1} if name == "half_cheetah_dir" else set()
+    assert set(tasks.train_tasks) & set(tasks.test_tasks) == shared
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
@@ -110,7 +133,10 @@ def test_fresh_tasks_depend_on_the_seed_alone(name: str) -> None:
     fresh = tasks.sample(7, seed=3)
     np.testing.assert_array_equal(fresh.params, tasks.sample(7, seed=3).params)
     assert fresh.hash == tasks.sample(7, seed=3).hash
-    assert not np.isin(tasks.sample(7, seed=4).params, fresh.params).any()
+    other = tasks.sample(7, seed=4).params
+    assert (other != fresh.params).any()
+    # There are but two directions of the half-cheetah.
+    assert np.isin(other, fresh.params).any() == (name == "half_cheetah_dir")
     assert fresh.test_tasks.tolist() == list(range(7))
     assert fresh.train_tasks.size == 0
     assert fresh.env == tasks.env
@@ -149,6 +175,15 @@ def test_fresh_tasks_are_from_the_same_distribution() -> None:
         ({"test_tasks": np.array([1, 1])}, "e: test_tasks must be sorted rows between 0 and 2"),
         ({"test_tasks": np.array([2, 1])}, "e: test_tasks must be sorted rows between 0 and 2"),
         ({"test_tasks": np.array([[1]])}, "e: test_tasks must be sorted rows between 0 and 2"),
+        (
+            {"splits": {"far": Split(np.array([0, 0]), np.array([1]))}},
+            "e: train_tasks of split 'far' must be sorted rows between 0 and 2",
+        ),
+        (
+            {"splits": {"far": Split(np.array([0]), np.array([3]))}},
+            "e: test_tasks of split 'far' must be sorted rows between 0 and 2",
+        ),
+        ({"bounds": {"c": (0.0, 1.0)}}, r"e: no task parameter 'c' \(known: a, b\)"),
     ],
 )
 def test_a_faulty_task_set_is_refused(changes: dict[str, object], message: str) -> None:
@@ -191,3 +226,132 @@ def test_a_wrong_task_is_refused(task: object, message: str) -> None:
 def test_a_right_task_comes_back_as_an_int() -> None:
     checked = task_set("point_robot_wind").check_task(np.int32(49))
     assert (checked, type(checked)) == (49, int)
+
+
+def rows(*numbers: int) -> NDArray[np.int64]:
+    return np.array(numbers, dtype=np.int64)
+
+
+def test_every_task_set_has_the_default_split() -> None:
+    tasks = small_set()
+    assert list(tasks.splits) == ["interpolate"]
+    assert tasks.splits["interpolate"].train_tasks.tolist() == tasks.train_tasks.tolist() == [0, 2]
+    assert tasks.splits["interpolate"].test_tasks.tolist() == tasks.test_tasks.tolist() == [1]
+    assert list(tasks.sample(2, seed=0).splits) == ["interpolate"]
+
+
+def test_a_split_need_not_hold_every_task() -> None:
+    tasks = small_set(splits={"extrapolate": Split(rows(1), rows(0))})
+    assert list(tasks.splits) == ["interpolate", "extrapolate"]
+    assert tasks.train_tasks.tolist() == [0, 2]
+    outer = tasks.splits["extrapolate"]
+    assert (outer.train_tasks.tolist(), outer.test_tasks.tolist()) == ([1], [0])
+    assert outer.train_tasks.dtype == outer.test_tasks.dtype == np.int64
+
+
+def test_the_default_split_can_train_on_what_it_tests() -> None:
+    both = Split(rows(0, 1), rows(0, 1))
+    tasks = small_set(test_tasks=rows(0, 1), splits={"interpolate": both})
+    assert tasks.train_tasks.tolist() == tasks.test_tasks.tolist() == [0, 1]
+    with pytest.raises(ValueError, match="e: test_tasks are not those of split 'interpolate'"):
+        small_set(test_tasks=rows(1), splits={"interpolate": both})
+
+
+def test_splits_and_bounds_cannot_be_written_to() -> None:
+    given = rows(1)
+    tasks = small_set(splits={"extrapolate": Split(given, rows(0))}, bounds={"a": (0.0, 9.0)})
+    given[:] = 2
+    assert tasks.splits["extrapolate"].train_tasks.tolist() == [1]
+    copied: Any
+    for copied in (tasks, copy.deepcopy(tasks), pickle.loads(pickle.dumps(tasks))):
+        assert copied.hash == tasks.hash
+        assert copied.bounds == {"a": (0.0, 9.0)}
+        for mapping in (copied.splits, copied.bounds):
+            with pytest.raises(TypeError, match="does not support item assignment"):
+                mapping["a"] = 1
+        arrays = [copied.params, copied.test_tasks]
+        for split in (*copied.splits.values(), copy.deepcopy(copied.splits["extrapolate"])):
+            arrays += [split.train_tasks, split.test_tasks]
+        for array in arrays:
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 1
+
+
+def test_the_hash_sees_every_split_but_the_plain_default() -> None:
+    rest = Split(rows(0, 2), rows(1))
+    assert small_set(splits={"interpolate": rest}).hash == small_set().hash
+    hashes = {
+        small_set(splits=splits).hash
+        for splits in (
+            {},
+            {"interpolate": Split(rows(0), rows(1))},
+            {"extrapolate": Split(rows(1), rows(0))},
+            {"extrapolate": Split(rows(1), rows(0, 2))},
+            {"other": Split(rows(1), rows(0))},
+        )
+    }
+    assert len(hashes) == 5
+
+
+def test_bounds_hold_for_every_task() -> None:
+    bounds = {"a": (0.0, 4.0)}
+    tasks = small_set(bounds=bounds)
+    message = "e: task parameter a must be between 0 and 4, got 4.5"
+    with pytest.raises(ValueError, match=message):
+        small_set(bounds=bounds, params=np.array([[1.0, 9.0], [4.5, 9.0]]), test_tasks=rows(0))
+    with pytest.raises(ValueError, match=message):
+        tasks.with_params({"a": 4.5, "b": 9.0})
+    with pytest.raises(ValueError, match=r"e: task parameter a must be between 0 and 4, got -0\.1"):
+        tasks.with_params({"a": -0.1, "b": 9.0})
+    assert tasks.with_params({"a": 4.0, "b": 9.0}).bounds == bounds
+    with pytest.raises(ValueError, match="e: task parameter a must be between 0 and 4, got 7"):
+        small_set(bounds=bounds, sampler=lambda generator, n: np.full((n, 2), 7.0)).sample(1, 0)
+
+
+def test_tasks_of_ones_own() -> None:
+    tasks = task_set("point_robot")
+    one = tasks.with_params({"goal_y": 0.75, "goal_x": np.float64(0.5)})
+    assert one.params.tolist() == [[0.5, 0.75]]
+    assert one.test_tasks.tolist() == [0]
+    assert one.train_tasks.size == 0
+    assert (one.env, one.param_names) == (tasks.env, tasks.param_names)
+    others: Any = [{"goal_x": 0, "goal_y": 1}, {"goal_x": np.float32(-1), "goal_y": np.int64(2)}]
+    two = tasks.with_params(others)
+    assert two.params.tolist() == [[0.0, 1.0], [-1.0, 2.0]]
+    assert two.test_tasks.tolist() == [0, 1]
+    assert one.sample(3, seed=1).hash == tasks.sample(3, seed=1).hash
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"gaol_x": 1.0, "goal_y": 0.0},
+            r"point_robot: no task parameter 'gaol_x'; did you mean 'goal_x'\? "
+            r"\(known: goal_x, goal_y\)",
+        ),
+        ({"mass": 1.0}, r"point_robot: no task parameter 'mass' \(known: goal_x, goal_y\)"),
+        ({3: 1.0}, r"point_robot: no task parameter '3' \(known: goal_x, goal_y\)"),
+        (
+            {"goal_x": 1.0},
+            r"point_robot: task_params lacks goal_y \(needed: goal_x, goal_y\)",
+        ),
+        ({}, r"point_robot: task_params lacks goal_x, goal_y \(needed: goal_x, goal_y\)"),
+        (
+            {"goal_x": float("nan"), "goal_y": 0.0},
+            "point_robot: task parameter goal_x must be a finite number, got nan",
+        ),
+        ({"goal_x": 0.0, "goal_y": np.inf}, "parameter goal_y must be a finite number, got inf"),
+        ({"goal_x": 0.0, "goal_y": 10**400}, "goal_y must be a finite number, got 1000"),
+        ({"goal_x": "1", "goal_y": 0.0}, "goal_x must be a finite number, got '1'"),
+        ({"goal_x": True, "goal_y": 0.0}, "goal_x must be a finite number, got True"),
+        ({"goal_x": [1.0], "goal_y": 0.0}, r"goal_x must be a finite number, got \[1.0\]"),
+        (5, "point_robot: task_params must be a mapping from goal_x, goal_y to numbers, or"),
+        ("ab", "point_robot: task_params must be a mapping from goal_x, goal_y to numbers, or"),
+        ([], r"point_robot: task_params must be a mapping from .*, got \[\]"),
+        ([{"goal_x": 0.0, "goal_y": 0.0}, 3], "point_robot: task_params must be a mapping, got 3"),
+    ],
+)
+def test_wrong_tasks_of_ones_own_are_refused(given: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        task_set("point_robot").with_params(given)
