@@ -93,7 +93,8 @@ def adaptation_figure(record: dict[str, Any]) -> Figure:
 
     groups = ordered_groups(record)
     figure = Figure(figsize=(5.4 * len(groups), 4.2), layout="constrained")
-    all_axes = figure.subplots(1, len(groups), squeeze=False, sharey=True)[0]
+    # Each with limits of its own: the references of the groups lie far apart.
+    all_axes = figure.subplots(1, len(groups), squeeze=False)[0]
     for axes, (name, group) in zip(all_axes, groups.items(), strict=True):
         _draw_curve(axes, name, group, record)
     all_axes[0].set_ylabel("return of a fresh episode")
