@@ -138,7 +138,7 @@ class RunFolder:
         except BlockingIOError:
             raise RunError(f"another process is at work in {self.path}: wait for it") from None
         # The lock is ours, so whatever others were writing here will never be finished.
-        for left in self.path.glob(".*.partial"):
+        for left in (one for name in RUN_FILES for one in self.path.glob(f".{name}.*.partial")):
             if f".{os.getpid()}." not in left.name:
                 left.unlink()
         config = self.path / CONFIG

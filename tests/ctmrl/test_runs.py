@@ -137,11 +137,12 @@ def test_a_restart_never_deletes_what_is_not_of_a_run(name: str, path: Path) -> 
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("x")
+    for name in ("thesis.tex", ".thesis.tex.1.partial"):
+        (tmp_path / name).write_text("x")
     for restart in (False, True):
         with pytest.raises(RunError, match="holds files that are not of a run: choose another"):
             RunFolder(tmp_path, SETTINGS, restart)
-    assert os.listdir(tmp_path) == ["thesis.tex"]
+    assert sorted(os.listdir(tmp_path)) == [".thesis.tex.1.partial", "thesis.tex"]
 
 
 def test_what_a_kill_left_before_the_first_file_is_no_obstacle(path: Path) -> None:
