@@ -1,13 +1,13 @@
 r"""Environment steps a second of the MuJoCo environments, beside all that steps the same physics.
 
-    python benchmarks/mujoco_steps.py --repetitions 7 --seconds 1 \
-        --out benchmarks/results/mujoco_steps.csv
+    python benchmarks/mujoco_steps.py --out benchmarks/results/mujoco_steps.csv
 
 Side by side, by turns, in one run: the native vector environment; Gymnasium's SyncVectorEnv and
 AsyncVectorEnv of the single one; SyncVectorEnv of Gymnasium's own class of the robot; EnvPool's,
-where it is installed; and a bare loop of `mj_step` on one core, which replays the very steps of the
-native one. Random actions, a task each (Gymnasium's class and EnvPool's have nominal parameters,
-EnvPool's its own time step). Resets are run but not counted. A ratio is taken within one turn.
+where it is installed; and a bare loop of `mj_step`, which replays the very steps of the native one,
+on one core and then in as many threads at once. Random actions, a task each (Gymnasium's class and
+EnvPool's have nominal parameters, EnvPool's its own time step). Resets are run but not counted. A
+ratio is taken within one turn.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -49,7 +50,7 @@ CLASSES = {
 }
 """Name of a robot in Gymnasium and EnvPool."""
 
-PLAIN_WIDTH = 140
+PLAIN_WIDTH = 165
 """Columns of the table where the output is not a terminal."""
 
 Floats = NDArray[np.float64]
@@ -67,10 +68,11 @@ class Benchmark:
     """Sub-environments side by side."""
     threads: int = 2
     """Native threads."""
-    repetitions: int = 7
+    repetitions: int = 41
     """Turns; the table has their medians."""
-    seconds: float = 1.0
-    """Least time a side is measured in a turn."""
+    seconds: float = 0.25
+    """Least time a side is measured in a turn: short, so that all sides of a turn see the same
+    machine."""
     out: Path | None = None
     """CSV file to write; without it nothing is written."""
 
@@ -90,20 +92,27 @@ class Result:
     envpool: int | None
     """None where it is not installed."""
     mj_step: int
+    """On one core."""
+    mj_step_at_once: int
+    """In as many threads as the native one has: what the machine can give."""
     native_to_gymnasium: float
-    """Native to the fastest of Gymnasium's three."""
+    """Native to the faster of SyncVectorEnv and AsyncVectorEnv."""
+    native_to_gymnasiums: float
+    """Native to SyncVectorEnv of Gymnasium's own class, which has nominal parameters."""
     native_to_envpool: float | None
     native_to_bare: float
     """Native to `threads` times bare `mj_step`."""
+    native_to_at_once: float
 
 
 def _steps_per_second(env: Any, actions: NDArray[np.float32], seconds: float) -> float:
     done, start = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - start) < seconds:
-        for action in actions:
-            terminated, truncated = env.step(action)[2:4]
-            # Whatever ends here is only reset in the next step.
-            done += len(terminated) - int(np.count_nonzero(terminated | truncated))
+    for action in itertools.cycle(actions):
+        terminated, truncated = env.step(action)[2:4]
+        # Whatever ends here is only reset in the next step.
+        done += len(terminated) - int(np.count_nonzero(terminated | truncated))
+        if (elapsed := time.perf_counter() - start) >= seconds:
+            break
     return done / elapsed
 
 
@@ -160,6 +169,11 @@ class _Bare:
         while (elapsed := time.perf_counter() - start) < seconds:
             done += self._replay(next(self._turn))
         return done / elapsed
+
+    def at_once(self, threads: int, seconds: float) -> float:
+        """Steps a second of several threads together; MuJoCo does not hold the interpreter."""
+        with ThreadPoolExecutor(threads) as pool:
+            return sum(pool.map(self, [seconds] * threads))
 
 
 def _envpool(robot: MujocoRobot, options: Benchmark) -> Any:
@@ -227,7 +241,9 @@ def _sides(name: str, options: Benchmark) -> Iterator[dict[str, Side]]:
             for side, env in several.items()
         }
         repeats = -(-robot.horizon // PRERECORDED)
-        sides["mj_step"] = _Bare(robot, tasks, np.tile(actions, (repeats, 1, 1)))
+        bare = _Bare(robot, tasks, np.tile(actions, (repeats, 1, 1)))
+        sides["mj_step"] = bare
+        sides["mj_step_at_once"] = functools.partial(bare.at_once, options.threads)
         yield sides
     finally:
         asynchronous.close()
@@ -249,9 +265,7 @@ def _measure(name: str, options: Benchmark) -> Result:
             for side, run in sides.items():
                 turns[side][turn] = run(options.seconds)
     native, pool = turns["native"], turns.get("envpool")
-    best_of_gymnasium = np.max(
-        [turns[side] for side in ("sync", "asynchronous", "sync_of_gymnasiums")], axis=0
-    )
+    faster = max(turns["sync"], turns["asynchronous"], key=np.median)
     return Result(
         resolve(name).name,
         options.num_envs,
@@ -263,9 +277,12 @@ def _measure(name: str, options: Benchmark) -> Result:
         _median(turns["sync_of_gymnasiums"]),
         None if pool is None else _median(pool),
         _median(turns["mj_step"]),
-        round(float(np.median(native / best_of_gymnasium)), 2),
-        None if pool is None else round(float(np.median(native / pool)), 2),
-        round(float(np.median(native / (options.threads * turns["mj_step"]))), 2),
+        _median(turns["mj_step_at_once"]),
+        _ratio(native, faster),
+        _ratio(native, turns["sync_of_gymnasiums"]),
+        None if pool is None else _ratio(native, pool),
+        _ratio(native, options.threads * turns["mj_step"]),
+        _ratio(native, turns["mj_step_at_once"]),
     )
 
 
@@ -273,12 +290,17 @@ def _median(rates: Floats) -> int:
     return round(float(np.median(rates)))
 
 
+def _ratio(rates: Floats, others: Floats) -> float:
+    return round(float(np.median(rates / others)), 2)
+
+
 def _table(results: list[Result], options: Benchmark) -> Table:
     title = f"Steps a second, {options.num_envs} sub-environments, {options.threads} threads"
     table = Table("environment", title=title)
-    for heading in ("native", "Sync", "Async", "Sync of its own", "EnvPool", "mj_step"):
+    for heading in ("native", "Sync", "Async", "Sync of its own", "EnvPool", "mj_step", "at once"):
         table.add_column(heading, justify="right")
-    for heading in ("/ Gymnasium", "/ EnvPool", f"/ {options.threads} mj_step"):
+    bare = f"/ {options.threads} mj_step"
+    for heading in ("/ Sync, Async", "/ its own", "/ EnvPool", bare, "/ at once"):
         table.add_column(heading, justify="right")
     for one in results:
         rates = (
@@ -288,8 +310,15 @@ def _table(results: list[Result], options: Benchmark) -> Table:
             one.sync_of_gymnasiums,
             one.envpool,
             one.mj_step,
+            one.mj_step_at_once,
         )
-        ratios = (one.native_to_gymnasium, one.native_to_envpool, one.native_to_bare)
+        ratios = (
+            one.native_to_gymnasium,
+            one.native_to_gymnasiums,
+            one.native_to_envpool,
+            one.native_to_bare,
+            one.native_to_at_once,
+        )
         table.add_row(
             one.env,
             *("-" if rate is None else f"{rate:,}" for rate in rates),

@@ -45,9 +45,10 @@ class AntGoal(MujocoRobot):
         test_tasks = interleaved_test_tasks(30, 10)
         return TaskSet(self.name, ("goal_x", "goal_y"), goals, test_tasks, _sample_goals)
 
-    def draw_noise(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
+    def draw_noise(self, generator: np.random.Generator) -> Floats:
         """Gymnasium's: uniform positions, normal velocities."""
-        return generator.uniform(-0.1, 0.1, self.nq), 0.1 * generator.standard_normal(self.nv)
+        positions = generator.uniform(-0.1, 0.1, self.nq)
+        return np.concatenate([positions, 0.1 * generator.standard_normal(self.nv)])
 
     def observe(self, state: Floats) -> NDArray[np.float32]:
         """Positions and velocities."""

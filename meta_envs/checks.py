@@ -120,7 +120,7 @@ def check_action(action: ArrayLike, shape: tuple[int, ...]) -> Floats:
     clipped: Floats = np.maximum(given, _LOW)
     np.minimum(clipped, _HIGH, out=clipped)
     # After the clipping every number is finite, so their sum is NaN just where one of them is.
-    if np.isnan(clipped.sum()):
+    if np.isnan(np.add.reduce(clipped, axis=None)):
         where = tuple(int(i) for i in np.argwhere(np.isnan(clipped))[0])
         raise ValueError(f"action holds NaN, first at index {where}")
     return clipped

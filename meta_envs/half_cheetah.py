@@ -50,9 +50,10 @@ class HalfCheetahVel(MujocoRobot):
             outer_splits(len(targets)),
         )
 
-    def draw_noise(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
+    def draw_noise(self, generator: np.random.Generator) -> Floats:
         """Gymnasium's: uniform positions, normal velocities."""
-        return generator.uniform(-0.1, 0.1, self.nq), 0.1 * generator.standard_normal(self.nv)
+        positions = generator.uniform(-0.1, 0.1, self.nq)
+        return np.concatenate([positions, 0.1 * generator.standard_normal(self.nv)])
 
     def observe(self, state: Floats) -> NDArray[np.float32]:
         """Positions but the first, velocities, and the torso's x, y and z."""

@@ -63,9 +63,9 @@ class HumanoidDir(MujocoRobot):
         """Directions at equal angles, all around."""
         return directions(self.name)
 
-    def draw_noise(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
+    def draw_noise(self, generator: np.random.Generator) -> Floats:
         """Gymnasium's: uniform positions and velocities."""
-        return generator.uniform(-0.01, 0.01, self.nq), generator.uniform(-0.01, 0.01, self.nv)
+        return generator.uniform(-0.01, 0.01, self.nq + self.nv)
 
     def initial_state(self, generators: Sequence[np.random.Generator]) -> Floats:
         """The model at rest, with noise, no warm start, and what its bodies then do."""

@@ -97,17 +97,14 @@ class MujocoRobot(Definition):
         return simulation.step(state, action)
 
     @abstractmethod
-    def draw_noise(self, generator: np.random.Generator) -> tuple[Floats, Floats]:
-        """What a start adds to the positions [nq] and the velocities [nv] of the model at rest."""
+    def draw_noise(self, generator: np.random.Generator) -> Floats:
+        """What a start adds to the positions and velocities of the model at rest, [nq + nv]."""
 
     def initial_state(self, generators: Sequence[np.random.Generator]) -> Floats:
         """The model at rest, with noise, and no warm start."""
         state = np.zeros((len(generators), self.nq + 2 * self.nv))
         state[:, : self.nq] = self.model.qpos0
-        for row, generator in zip(state, generators, strict=True):
-            positions, velocities = self.draw_noise(generator)
-            row[: self.nq] += positions
-            row[self.nq : self.nq + self.nv] += velocities
+        state[:, : self.nq + self.nv] += [self.draw_noise(generator) for generator in generators]
         return state
 
     def still(self, state: Floats, params: Floats) -> Floats:
@@ -132,5 +129,5 @@ class MujocoRobot(Definition):
 
 def sum_of_squares(action: Floats) -> Floats:
     """Sum of the squares of each row, [n, A] -> [n]."""
-    total: Floats = np.square(action).sum(axis=1)
+    total: Floats = np.add.reduce(action * action, axis=1)
     return total

@@ -92,11 +92,12 @@ class MujocoSimulation(Simulation):
         np.multiply(action, self._strength, out=self._control)
         self._batch.step(rows, nstep=self._robot.frame_skip)
         moved = np.empty(self._shape)
+        # Of a simulation that was not stepped, this is still what was put there.
         moved[:, : self._width] = self._motion
         for columns, output in self._carried:
-            moved[:, columns] = output
-        if rows is not None:
-            moved[~rows] = state[~rows]
+            moved[:, columns] = (
+                output if rows is None else np.where(rows[:, None], output, state[:, columns])
+            )
         return moved
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import overload
 
 import numpy as np
@@ -38,6 +38,10 @@ class Streams(Sequence[np.random.Generator]):
         if row not in self._made:
             self._made[row] = seeding.np_random(self._seeds[row])[0]
         return self._made[row]
+
+    def __iter__(self) -> Iterator[np.random.Generator]:
+        """The generators in their order."""
+        return (self._made.get(row) or self[place] for place, row in enumerate(self._rows))
 
     def of(self, rows: Sequence[int]) -> Streams:
         """The streams of these sub-environments; a draw from one is a draw from the original."""
