@@ -147,7 +147,7 @@ def main(config: EvaluateConfig) -> None:
         )
     tasks = task_set(run_config.env)
     if config.fresh:
-        tasks = tasks.sample(config.fresh, seed)
+        tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
     record = evaluate_agent(agent, run_config, tasks, groups, best, seed)
     Console().print(result_table(record))

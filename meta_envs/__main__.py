@@ -29,15 +29,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     It is 1 for an environment that fails a check, 2 for a user's mistake, 130 for Ctrl-C.
     """
-    command = tyro.cli(
-        List | Show | Render | Check | Gallery, prog="python -m meta_envs", args=argv
-    )
     # Without emoji, for a Definition's `module:Class:` is none.
     console = Console(emoji=False)
     if not console.is_terminal:
         console = Console(width=PLAIN_WIDTH, emoji=False)
     errors = Console(stderr=True, emoji=False)
     try:
+        command = tyro.cli(
+            List | Show | Render | Check | Gallery, prog="python -m meta_envs", args=argv
+        )
         return command.run(console)
     except MistakeError as mistake:
         errors.print(str(mistake), soft_wrap=True, markup=False, highlight=False)

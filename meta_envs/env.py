@@ -92,6 +92,15 @@ class MetaEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Row of the task set this environment is on."""
         return self._task
 
+    @property
+    def state(self) -> Floats:
+        """Its state, [S], read-only."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset() first")
+        view: Floats = self._state[0]
+        view.setflags(write=False)
+        return view
+
     def _set_task(self, task: int) -> None:
         self._task = task
         self._params = self.task_set.params[task : task + 1]

@@ -106,7 +106,7 @@ class HalfCheetahDir(HalfCheetahVel):
             both,
             _sample_directions,
             {DEFAULT_SPLIT: Split(both, both)},
-            {"direction": (-1.0, 1.0)},
+            choices={"direction": (-1.0, 1.0)},
         )
 
     def reward(

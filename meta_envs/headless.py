@@ -13,6 +13,7 @@ import importlib
 import os
 import platform
 import threading
+import warnings
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
@@ -20,13 +21,14 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Protocol
 
-PACKAGES = {
-    "egl": "EGL (Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri; Fedora: mesa-libEGL)",
-    "osmesa": "OSMesa (Debian, Ubuntu: apt install libosmesa6; Fedora: mesa-compat-libOSMesa)",
-    "glfw": "a display, or MUJOCO_GL=egl",
-    "cgl": "a macOS session that may use OpenGL",
+REMEDIES = {
+    "egl": "install EGL (Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri; Fedora: mesa-libEGL)",
+    "osmesa": "install OSMesa (Debian, Ubuntu: apt install libosmesa6; "
+    "Fedora: mesa-compat-libOSMesa)",
+    "glfw": "it needs a display",
+    "cgl": "it needs a macOS session that may use OpenGL",
 }
-"""What each library needs, for a user who lacks it."""
+"""What a user can do who lacks a library or what it needs."""
 AUTOMATIC = ("", "enable", "enabled", "on", "true", "1")
 OFF = ("disable", "disabled", "off", "false", "0")
 SYNONYMS = {"glx": "glfw", "wgl": "glfw"}
@@ -50,9 +52,9 @@ def backend() -> str:
         raise RenderingUnavailableError(f"MUJOCO_GL={wanted} switches pictures off; unset it")
     if wanted not in AUTOMATIC:
         named = SYNONYMS.get(wanted, wanted)
-        if named not in PACKAGES:
+        if named not in REMEDIES:
             raise RenderingUnavailableError(
-                f"MUJOCO_GL={wanted} is not known (known: {', '.join(PACKAGES)}); unset it"
+                f"MUJOCO_GL={wanted} is not known (known: {', '.join(REMEDIES)}); unset it"
             )
         return named
     if platform.system() != "Linux":
@@ -64,8 +66,21 @@ def backend() -> str:
     if bound in ("", "osmesa") and ctypes.util.find_library("OSMesa"):
         return "osmesa"
     raise RenderingUnavailableError(
-        "pictures of MuJoCo need OpenGL that works without a display, and none was found: install "
-        f"{PACKAGES['egl']} or {PACKAGES['osmesa']}"
+        "pictures of MuJoCo need OpenGL that works without a display, and none was found: "
+        f"{REMEDIES['egl']}, or {REMEDIES['osmesa']}"
+    )
+
+
+def unavailable(name: str, error: Exception) -> RenderingUnavailableError:
+    """What to tell a user for whom a library failed.
+
+    Args:
+        name: the library, one that `backend` returns.
+        error: what it raised.
+    """
+    other = ", or unset MUJOCO_GL" if os.environ.get("MUJOCO_GL") else ""
+    return RenderingUnavailableError(
+        f"pictures of MuJoCo cannot be drawn with {name} ({error}): {REMEDIES[name]}{other}"
     )
 
 
@@ -176,16 +191,24 @@ if hasattr(os, "register_at_fork"):
 def _open(width: int, height: int) -> _Context:
     name = backend()
     try:
+        if name == "glfw":
+            _require_display()
         context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
     # What a missing library or display raises differs from one to the other.
     except Exception as error:
-        raise RenderingUnavailableError(
-            f"pictures of MuJoCo cannot be drawn with {name} ({error}): install {PACKAGES[name]}"
-        ) from error
+        raise unavailable(name, error) from error
     # At the end, run before MuJoCo's own, which was registered with the context and takes EGL down.
     atexit.unregister(close)
     atexit.register(close)
     return _Context(context)
+
+
+def _require_display() -> None:
+    """Raise what GLFW only warns of: drawing without a display ends in a fatal error."""
+    glfw: Any = importlib.import_module("glfw")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", glfw.GLFWError)
+        glfw.init()
 
 
 def _release() -> None:

@@ -166,7 +166,6 @@ def register(row: Row) -> None:
     """
     if ENVIRONMENTS.get(row.name, row) is not row or row.id in gymnasium.registry:
         raise ValueError(f"there is an environment '{row.name}' or {row.id} already")
-    ENVIRONMENTS[row.name] = row
     gymnasium.register(
         id=row.id,
         entry_point="meta_envs.env:MetaEnv",
@@ -174,6 +173,7 @@ def register(row: Row) -> None:
         max_episode_steps=row.horizon,
         kwargs={"name": row.name},
     )
+    ENVIRONMENTS[row.name] = row
 
 
 def unregister(row: Row) -> None:

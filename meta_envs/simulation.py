@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,17 +10,25 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from meta_envs import headless
 from meta_envs.definition import Floats, Simulation
 
 try:
     import mujoco
     from mujoco.batch import Batch
 except ImportError as error:
+    if error.name not in ("mujoco", "mujoco.batch"):
+        raise
     raise ImportError(
         "this environment needs MuJoCo 3.17 or newer, the first that steps many simulations on "
         'native threads (mujoco.batch): pip install "mujoco>=3.17"',
         name=error.name,
     ) from error
+except Exception as error:
+    # MuJoCo loads the OpenGL library that MUJOCO_GL names as soon as it is imported.
+    if not os.environ.get("MUJOCO_GL"):
+        raise
+    raise headless.unavailable(headless.backend(), error) from error
 
 if TYPE_CHECKING:
     from meta_envs.mujoco_robot import MujocoRobot

@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -18,6 +18,8 @@ Sampler = Callable[[np.random.Generator, int], NDArray[np.float64]]
 
 DEFAULT_SPLIT = "interpolate"
 """Name of the split every task set has."""
+MOST_NAMES = 6
+"""Names that an error message lists; of more parameters it says where they are."""
 
 
 def interleaved_test_tasks(n_train: int, n_test: int) -> NDArray[np.int64]:
@@ -31,6 +33,13 @@ def _frozen(values: ArrayLike, dtype: type[np.generic]) -> NDArray[Any]:
     array = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names for an error message."""
+    more = len(names) - MOST_NAMES
+    rest = f" and {more} more of TaskSet.param_names" if more > 0 else ""
+    return ", ".join(names[:MOST_NAMES]) + rest
 
 
 def _is_finite_number(value: object) -> bool:
@@ -81,10 +90,11 @@ class TaskSet:
             and "extrapolate" is there where the field has one. Give the others only; give the
             default one too where its training tasks are not simply all that are not tested.
         bounds: lowest and highest possible value of parameters that have any, by their names.
+        choices: the only possible values of parameters that have any, by their names.
 
     Raises:
-        ValueError: params of another shape, not finite or out of bounds; rows of a split unsorted
-            or out of range; bounds of a parameter that is not there.
+        ValueError: params of another shape, not finite, out of bounds or none of the choices; rows
+            of a split unsorted or out of range; bounds or choices of a parameter that is not there.
     """
 
     env: str
@@ -94,6 +104,7 @@ class TaskSet:
     sampler: Sampler = field(repr=False)
     splits: Mapping[str, Split] = field(default_factory=dict, repr=False)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict, repr=False)
+    choices: Mapping[str, tuple[float, ...]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         """Check the contents and keep read-only copies of them."""
@@ -104,11 +115,13 @@ class TaskSet:
             )
         if not np.isfinite(params).all():
             raise ValueError(f"{self.env}: params must be finite")
-        for name in self.bounds:
+        for name in (*self.bounds, *self.choices):
             self._check_name(name)
         object.__setattr__(self, "params", params)
         object.__setattr__(self, "bounds", MappingProxyType(dict(self.bounds)))
+        object.__setattr__(self, "choices", MappingProxyType(dict(self.choices)))
         self._check_bounds()
+        self._check_choices()
         object.__setattr__(self, "test_tasks", _frozen(self.test_tasks, np.int64))
         self._check_rows("test_tasks", self.test_tasks)
         object.__setattr__(self, "splits", MappingProxyType(self._every_split()))
@@ -140,20 +153,29 @@ class TaskSet:
                     f"got {outside[0]:g}"
                 )
 
+    def _check_choices(self) -> None:
+        for name, allowed in self.choices.items():
+            values = self.params[:, self.param_names.index(name)]
+            others = values[~np.isin(values, allowed)]
+            if others.size:
+                raise ValueError(
+                    f"{self.env}: task parameter {name} must be "
+                    f"{' or '.join(f'{value:g}' for value in allowed)}, got {others[0]:g}"
+                )
+
     def _check_name(self, name: object) -> None:
         if name not in self.param_names:
             near = difflib.get_close_matches(str(name), self.param_names, n=1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise ValueError(
-                f"{self.env}: no task parameter '{name}'{hint} "
-                f"(known: {', '.join(self.param_names)})"
+                f"{self.env}: no task parameter '{name}'{hint} (known: {_listed(self.param_names)})"
             )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies are made anew, for a copied array could be written to."""
-        splits, bounds = dict(self.splits), dict(self.bounds)
         given = (self.env, self.param_names, self.params, self.test_tasks, self.sampler)
-        return TaskSet, (*given, splits, bounds)
+        mappings = (self.splits, self.bounds, self.choices)
+        return TaskSet, (*given, *map(dict, mappings))
 
     def __len__(self) -> int:
         """Number of tasks."""
@@ -190,15 +212,16 @@ class TaskSet:
                 f"{self.env}: task must be an integer, got {task!r} ({type(task).__name__})"
             )
         if not 0 <= task < len(self):
-            raise ValueError(f"{self.env} has tasks 0 to {len(self) - 1}, got task={int(task)}")
+            valid = f"tasks 0 to {len(self) - 1}" if len(self) > 1 else "only task 0 here"
+            raise ValueError(f"{self.env} has {valid}, got task={int(task)}")
         return int(task)
 
-    def sample(self, n_tasks: int, seed: int) -> TaskSet:
+    def sample(self, seed: int, n_tasks: int) -> TaskSet:
         """Draw fresh tasks, all of them test tasks, from the distribution of this set.
 
         Args:
-            n_tasks: how many, at least 1.
             seed: of a private generator, non-negative; the same seed gives the same tasks.
+            n_tasks: how many, at least 1.
 
         Raises:
             ValueError: either argument out of range.
@@ -221,12 +244,12 @@ class TaskSet:
 
         Raises:
             ValueError: a name unknown (the message has the nearest) or missing, a value that is no
-                finite number or is out of bounds.
+                finite number, is out of bounds or is none of the choices.
         """
         given = [task_params] if isinstance(task_params, Mapping) else task_params
         if not isinstance(given, list | tuple) or not given:
             raise ValueError(
-                f"{self.env}: task_params must be a mapping from {', '.join(self.param_names)} "
+                f"{self.env}: task_params must be a mapping from {_listed(self.param_names)} "
                 f"to numbers, or a sequence of such mappings, got {task_params!r}"
             )
         return self._others(np.array([self._row(one) for one in given]))
@@ -239,8 +262,8 @@ class TaskSet:
         missing = [name for name in self.param_names if name not in task_params]
         if missing:
             raise ValueError(
-                f"{self.env}: task_params lacks {', '.join(missing)} "
-                f"(needed: {', '.join(self.param_names)})"
+                f"{self.env}: task_params lacks {_listed(missing)} "
+                f"(needed: {_listed(self.param_names)})"
             )
         for name, value in task_params.items():
             if not _is_finite_number(value):
@@ -252,4 +275,4 @@ class TaskSet:
     def _others(self, params: NDArray[np.float64]) -> TaskSet:
         """Other tasks of the same environment, all of them test tasks."""
         rows = np.arange(len(params))
-        return TaskSet(self.env, self.param_names, params, rows, self.sampler, bounds=self.bounds)
+        return replace(self, params=params, test_tasks=rows, splits={})

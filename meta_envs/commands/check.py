@@ -21,8 +21,7 @@ class Check:
     """Put an environment to every conformance check; exit code 1 if it fails any."""
 
     env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
-    """Environment: any of its names, or `module:Class` of your own Definition, from any module
-    that Python finds from the current folder."""
+    """Environment: any of its names, or `module:Class` of a Definition of your own."""
 
     def run(self, console: Console) -> int:
         """Print a table of what passed and what failed, and why."""

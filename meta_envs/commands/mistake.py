@@ -20,6 +20,15 @@ def mistakes() -> Iterator[None]:
     except (ValueError, RenderingUnavailableError) as error:
         raise MistakeError(str(error)) from None
     except ImportError as error:
+        if _interrupted(error):
+            raise KeyboardInterrupt from None
         if not (error.name or "").startswith("mujoco"):
             raise
         raise MistakeError(str(error)) from None
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C came while a compiled module was being loaded, which reports it as a fault."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None

@@ -18,6 +18,8 @@ from meta_envs.registry import ENVIRONMENTS, Row, definition, resolve, task_set
 
 MOST_PICTURES = 100
 """Pictures of an animation, about; an episode of more steps is shown in larger ones."""
+MOST_A_SECOND = 50
+"""Pictures a second of an animation; browsers show one that is faster at a tenth of its speed."""
 TILE, CAPTION, COLUMNS = 232, 26, 5
 """Size of one environment's picture in the gallery, height of its name, and pictures a row."""
 GALLERY_STEPS = 20
@@ -46,15 +48,16 @@ class Render:
             if self.seed < 0:
                 raise ValueError(f"--seed must be at least 0, got {self.seed}")
         animated = self.out.suffix.lower() == ".gif"
-        every = math.ceil(row.horizon / MOST_PICTURES) if animated else None
+        fps = definition(row.name).render_fps
+        fewest = max(row.horizon / MOST_PICTURES, fps / MOST_A_SECOND)
+        every = math.ceil(fewest) if animated else None
         found = []
         with mistakes(), console.status("Running the episode ...") as status:
             for picture in episode.pictures(row, self.task, self.seed, every):
                 found.append(picture)
                 status.update(f"Made {len(found)} pictures ...")
         if every is not None:
-            pause = round(1000 * every / definition(row.name).render_fps)
-            files.write_file(self.out, files.encode_gif(found, pause))
+            files.write_file(self.out, files.encode_gif(found, round(1000 * every / fps)))
         else:
             files.write_file(self.out, files.encode_png(found[-1]))
         written = f"Wrote {self.out}: {episode.who_acts(row, self.seed)} on task {self.task}."

@@ -39,8 +39,7 @@ class Show:
     task: Annotated[int | None, tyro.conf.arg(metavar="TASK")] = None
     """A task to show in detail."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Picture (.png) to write: the last of an episode on --task, or on task 0; the exact optimum's
-    where it is known, else one of random actions."""
+    """Picture (.png) to write: the end of the exact optimum's episode, or of a random one."""
 
     def run(self, console: Console) -> int:
         """Print it, and write the picture if one is wanted."""

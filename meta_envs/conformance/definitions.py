@@ -164,9 +164,11 @@ def _check_extrapolation(tasks: TaskSet, split: Split) -> None:
 def sampler_gives_tasks(subject: Subject) -> None:
     """Fresh tasks depend on the seed alone, and an environment runs on them."""
     tasks = subject.task_set
-    fresh = tasks.sample(50, seed=0)
-    require_same(fresh.params, tasks.sample(50, seed=0).params, "one seed gives two samples")
-    differ = (fresh.params != tasks.sample(50, seed=1).params).any()
+    fresh = tasks.sample(seed=0, n_tasks=50)
+    require_same(
+        fresh.params, tasks.sample(seed=0, n_tasks=50).params, "one seed gives two samples"
+    )
+    differ = (fresh.params != tasks.sample(seed=1, n_tasks=50).params).any()
     require(differ, "two seeds give the same sample")
     env = subject.make_vec(tasks=range(5), task_set=fresh)
     env.reset(seed=0)
@@ -248,7 +250,7 @@ def shared_generators_are_left_alone(subject: Subject) -> None:
     with no_shared_generator():
         made, tasks = _made_anew(subject), subject.task_set
         made.tasks()
-        tasks.sample(5, seed=0)
+        tasks.sample(seed=0, n_tasks=5)
         single = subject.make(task=len(tasks) - 1)
         vector = subject.make_vec(tasks=subject.tasks(ROWS))
         single.reset(seed=3)

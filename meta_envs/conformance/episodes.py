@@ -99,6 +99,7 @@ def _compare_shells(subject: Subject, mode: AutoresetMode, num_envs: int, limit:
     (obs, info), (its_obs, its_info) = native.reset(seed=3), sync.reset(seed=3)
     require_same(obs, its_obs, f"{name}the first observation differs")
     _compare_infos(info, its_info, name, exact=True)
+    _compare_states(native, sync, f"{name}the state at the start differs")
     for step, action in enumerate(subject.actions(2 * limit + 5, num_envs)):
         given = action.copy()
         *mine, info = native.step(action)
@@ -107,6 +108,7 @@ def _compare_shells(subject: Subject, mode: AutoresetMode, num_envs: int, limit:
         for kind, one, other in zip(kinds, mine, its, strict=True):
             require_same(one, other, f"{name}{kind} differs at step {step}")
         _compare_infos(info, its_info, name, exact=mode is not AutoresetMode.SAME_STEP)
+        _compare_states(native, sync, f"{name}state differs at step {step}")
         require_same(action, given, f"{name}step writes into the actions it is given")
         # Resetting a third of them midway puts the sub-environments out of step.
         mask = np.zeros(num_envs, dtype=np.bool_)
@@ -123,6 +125,12 @@ def _compare_resets(native: Any, sync: Any, mask: Any, step: int, name: str) -> 
     its_obs, its_info = sync.reset(seed=seeds, options={"reset_mask": mask})
     require_same(obs, its_obs, f"{name}the observation after a reset differs")
     require_same(info["task"][mask], its_info["task"][mask], f"{name}the task differs")
+    _compare_states(native, sync, f"{name}the state after a reset differs")
+
+
+def _compare_states(native: Any, sync: Any, otherwise: str) -> None:
+    """Of observations, which are rounded and need not show everything, this is the rest."""
+    require_same(native.state, np.stack([one.unwrapped.state for one in sync.envs]), otherwise)
 
 
 def _compare_infos(mine: dict[str, Any], its: dict[str, Any], name: str, exact: bool) -> None:

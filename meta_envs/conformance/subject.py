@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,10 @@ from meta_envs import registry
 from meta_envs.definition import Definition
 from meta_envs.registry import ENVIRONMENTS, Row
 from meta_envs.tasks import TaskSet
+
+NAMED = re.compile(r"\w+(\.\w+)*(?<!\.py):\w+")
+"""`module:Class`, the module as in an import."""
+SHORT_NAME = re.compile("[a-z][a-z0-9_]*")
 
 
 class NonConformityError(Exception):
@@ -129,17 +134,28 @@ def lent(row: Row) -> Iterator[None]:
 
 def _row_of(env: str) -> Row:
     """The row that a Definition would have in the registry."""
+    if not NAMED.fullmatch(env):
+        raise ValueError(f"{env}: write module:Class, such as my_package.my_robot:MyRobot")
     module, _, attribute = env.partition(":")
     try:
-        made = getattr(importlib.import_module(module), attribute)
+        made = getattr(importlib.import_module(module), attribute, None)
     except ModuleNotFoundError as error:
         raise ValueError(f"{env}: there is no module '{error.name}' on Python's path") from None
-    except AttributeError:
-        raise ValueError(f"{env}: module '{module}' has no '{attribute}'") from None
+    # Whatever else the module raises is its author's mistake.
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{env}: importing '{module}' ends in {reason}") from error
+    if made is None:
+        raise ValueError(f"{env}: module '{module}' has no '{attribute}'")
     if not (inspect.isclass(made) and issubclass(made, Definition)):
         raise ValueError(f"{env}: this is not a subclass of meta_envs.definition.Definition")
     for name, kind in (("name", str), ("horizon", int)):
         if not isinstance(getattr(made, name, None), kind):
             raise ValueError(f"{env}: it must have a class variable '{name}' ({kind.__name__})")
+    if not SHORT_NAME.fullmatch(made.name):
+        raise ValueError(
+            f"{env}: its name must be lower-case letters, digits and underscores, such as "
+            f"'my_robot', got '{made.name}'"
+        )
     camel = "".join(part.capitalize() for part in made.name.split("_"))
     return Row(made.name, f"{camel}-v0", made.name.replace("_", "-"), env, made.horizon, "")

@@ -111,7 +111,7 @@ def test_fresh_tasks(
     evaluate(finished_run.path, fresh=3, seed=7, repetitions=2, out=tmp_path / "out")
     assert "fresh tasks (3)" in capsys.readouterr().out
     record = read_json(tmp_path / "out" / "evaluation.json")
-    fresh = task_set("point_robot_wind").sample(3, 7)
+    fresh = task_set("point_robot_wind").sample(seed=7, n_tasks=3)
     assert list(record["groups"]) == ["fresh"]
     group = record["groups"]["fresh"]
     assert group["params"] == fresh.params.tolist()
@@ -126,7 +126,7 @@ def test_fresh_tasks(
 
 def test_another_seed_explores_otherwise(finished_run: FinishedRun, agent: Agent) -> None:
     config = config_from_settings(read_json(finished_run.path / "config.json"), Path())
-    tasks = task_set("point_robot_wind").sample(2, 0)
+    tasks = task_set("point_robot_wind").sample(seed=0, n_tasks=2)
     groups = {"fresh": np.arange(2)}
     records = [evaluate_agent(agent, config, tasks, groups, {}, seed) for seed in (0, 0, 1)]
     assert records[0] == records[1]

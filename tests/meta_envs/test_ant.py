@@ -18,7 +18,7 @@ def test_the_goals_are_the_fields() -> None:
     np.testing.assert_allclose(np.hypot(*goals.T), 2.0, atol=1e-12)
     assert tasks.test_tasks.tolist() == list(range(2, 40, 4))
     assert list(tasks.splits) == ["interpolate"]
-    fresh = tasks.sample(500, seed=0).params
+    fresh = tasks.sample(seed=0, n_tasks=500).params
     np.testing.assert_allclose(np.hypot(*fresh.T), 2.0, atol=1e-12)
     assert np.abs(fresh.mean(axis=0)).max() < 0.3
 

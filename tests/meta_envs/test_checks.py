@@ -180,6 +180,7 @@ def test_what_needs_a_reset_first() -> None:
     for call in (
         lambda: single.step(np.zeros(2)),
         lambda: vector.step(np.zeros((2, 2))),
+        lambda: single.state,
         lambda: vector.state,
         MetaEnv("point_robot", render_mode="rgb_array").render,
         MetaVectorEnv("point_robot", render_mode="rgb_array").render,

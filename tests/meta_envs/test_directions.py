@@ -14,7 +14,7 @@ def test_directions_have_the_splits_of_the_field() -> None:
     np.testing.assert_array_equal(tasks.params[:, 0], circle(40))
     assert tasks.test_tasks.tolist() == list(range(2, 40, 4))
     assert tasks.splits["extrapolate"].train_tasks.tolist() == list(range(10, 30))
-    fresh = tasks.sample(1000, seed=0).params[:, 0]
+    fresh = tasks.sample(seed=0, n_tasks=1000).params[:, 0]
     assert 0.0 <= fresh.min() < 0.05
     assert 2 * np.pi - 0.05 < fresh.max() <= 2 * np.pi
     # Uniform all around, so that they cancel out.

@@ -110,7 +110,7 @@ def test_tasks_and_how_to_change_them() -> None:
 
 
 def test_another_task_set() -> None:
-    fresh = task_set("point_robot").sample(3, seed=0)
+    fresh = task_set("point_robot").sample(seed=0, n_tasks=3)
     env = MetaEnv("point_robot", task=2, task_set=fresh)
     vector = MetaVectorEnv("PointRobot-v0", tasks=[2], task_set=fresh)
     env.reset()
@@ -138,6 +138,12 @@ def test_state_and_params_are_read_only() -> None:
             array[0] = 1.0
     env.tasks[0] = 9
     assert env.tasks.tolist() == [0, 0]
+    single = MetaEnv("point_robot_wind")
+    single.reset()
+    single.step(np.ones(2))
+    with pytest.raises(ValueError, match="read-only"):
+        single.state[0] = 1.0
+    np.testing.assert_array_equal(single.state, 0.1 + single.task_set.params[0])
 
 
 def test_the_same_seed_gives_the_same_episode(noisy_robot: str) -> None:

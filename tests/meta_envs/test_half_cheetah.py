@@ -3,7 +3,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from meta_envs import MetaVectorEnv, task_set
+from meta_envs import MetaEnv, MetaVectorEnv, TaskSet, task_set
 from tests.meta_envs.gymnasium_twin import Floats, assert_same_state, robot_of, twins
 
 
@@ -13,9 +13,8 @@ def _own_log(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(str(tmp_path))
 
 
-def still_returns(name: str) -> Floats:
-    tasks = task_set(name)
-    env = MetaVectorEnv(name, tasks=range(len(tasks)))
+def still_returns(tasks: TaskSet) -> Floats:
+    env = MetaVectorEnv(tasks.env, tasks=range(len(tasks)), task_set=tasks)
     env.reset(seed=0)
     total = np.zeros(len(tasks))
     for _ in range(200):
@@ -32,7 +31,7 @@ def test_the_targets_are_the_fields() -> None:
     assert tasks.test_tasks.tolist() == list(range(2, 98, 5))
     assert len(tasks.train_tasks) == 80
     assert list(tasks.splits) == ["interpolate", "extrapolate", "moderate", "extreme"]
-    fresh = tasks.sample(2000, seed=0).params[:, 0]
+    fresh = tasks.sample(seed=0, n_tasks=2000).params[:, 0]
     assert 1.0 <= fresh.min() < 1.01
     assert 2.99 < fresh.max() <= 3.0
 
@@ -41,9 +40,12 @@ def test_the_two_directions_are_for_training_and_for_the_test() -> None:
     tasks = task_set("half_cheetah_dir")
     assert tasks.params.tolist() == [[-1.0], [1.0]]
     assert tasks.train_tasks.tolist() == tasks.test_tasks.tolist() == [0, 1]
-    fresh = tasks.sample(100, seed=0).params[:, 0]
+    fresh = tasks.sample(seed=0, n_tasks=100).params[:, 0]
     assert set(fresh) == {-1.0, 1.0}
     assert 30 < (fresh > 0).sum() < 70
+    for direction in (0.0, 0.5):
+        with pytest.raises(ValueError, match=r"direction must be -1 or 1, got 0"):
+            MetaEnv("half_cheetah_dir", task_params={"direction": direction})
 
 
 def test_it_moves_as_gymnasiums_does() -> None:
@@ -76,10 +78,14 @@ def test_it_starts_as_gymnasiums_does() -> None:
 
 
 def test_standing_still() -> None:
-    found = still_returns("half_cheetah_vel")
+    tasks = task_set("half_cheetah_vel")
+    found = still_returns(tasks)
     assert found.mean() == pytest.approx(-400.0, abs=0.5)
-    np.testing.assert_allclose(found, -200.0 * task_set("half_cheetah_vel").params[:, 0], atol=3.0)
-    np.testing.assert_allclose(still_returns("half_cheetah_dir"), 0.0, atol=3.0)
+    np.testing.assert_allclose(found, -200.0 * tasks.params[:, 0], atol=3.0)
+    # The field's other range, from 0 m/s: -300.
+    slower = [{"target_velocity": float(target)} for target in np.linspace(0.0, 3.0, 61)]
+    assert still_returns(tasks.with_params(slower)).mean() == pytest.approx(-300.0, abs=1.0)
+    np.testing.assert_allclose(still_returns(task_set("half_cheetah_dir")), 0.0, atol=3.0)
 
 
 def test_running_the_right_way_pays() -> None:

@@ -125,9 +125,16 @@ class NoFunction:
         return None
 
 
-@pytest.mark.parametrize("name", ["egl", "osmesa", "glfw"])
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("egl", "install EGL .*libegl1.*, or unset MUJOCO_GL"),
+        ("osmesa", "install OSMesa .*libosmesa6.*, or unset MUJOCO_GL"),
+        ("glfw", "it needs a display, or unset MUJOCO_GL"),
+    ],
+)
 def test_what_cannot_be_opened_names_the_package(
-    name: str, monkeypatch: pytest.MonkeyPatch
+    name: str, remedy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(module: str) -> None:
         raise AttributeError(f"no {module}")
@@ -136,7 +143,9 @@ def test_what_cannot_be_opened_names_the_package(
     monkeypatch.setenv("MUJOCO_GL", name)
     monkeypatch.setattr(importlib, "import_module", broken)
     with (
-        pytest.raises(RenderingUnavailableError, match=f"with {name} .no mujoco.{name}.: install "),
+        pytest.raises(
+            RenderingUnavailableError, match=rf"with {name} .no (mujoco\.)?{name}.: {remedy}"
+        ),
         headless.current(8, 8),
     ):
         pass
@@ -160,6 +169,35 @@ def test_asking_whether_egl_works_disturbs_nobody_who_draws() -> None:
     headless.close()
     with headless.current(8, 8):
         assert gl.glGetString(gl.GL_VERSION) == version
+
+
+@pytest.mark.skipif(
+    platform.system() != "Linux" or ctypes.util.find_library("OSMesa") is not None,
+    reason="needs a Linux without OSMesa",
+)
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("osmesa", "pictures of MuJoCo cannot be drawn with osmesa ("),
+        ("vulkan", "MUJOCO_GL=vulkan is not known"),
+        ("glfw", "pictures of MuJoCo cannot be drawn with glfw ("),
+    ],
+)
+def test_a_library_asked_for_and_missing_is_one_sentence(value: str, message: str) -> None:
+    """For real, because MuJoCo itself loads what the variable names."""
+    arguments = ["render", "half_cheetah_dir", "--out", "absent.png"]
+    variables = {name: one for name, one in os.environ.items() if "DISPLAY" not in name}
+    done = subprocess.run(
+        [sys.executable, "-m", "meta_envs", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**variables, "MUJOCO_GL": value},
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(message)
+    assert done.stderr.count("\n") == 1
+    assert "unset" in done.stderr
 
 
 BEFORE_MUJOCO = """

@@ -78,6 +78,17 @@ def test_ctrl_c_is_a_sentence_and_exit_code_130(
     assert capsys.readouterr().err == "Interrupted; nothing is left half written.\n"
 
 
+def test_ctrl_c_before_the_command_is_known(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*arguments: Any, **kwargs: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tyro.cli", interrupted)
+    assert main(["list"]) == 130
+    assert capsys.readouterr().err == "Interrupted; nothing is left half written.\n"
+
+
 def test_the_module_runs_as_a_command() -> None:
     done = run("show", "point_robt")
     assert done.returncode == 2

@@ -78,22 +78,24 @@ def test_wrong_numbers_of_threads_are_refused(threads: Any) -> None:
         MetaVectorEnv("half_cheetah_dir", num_envs=2, threads=threads)
 
 
-def test_a_start_depends_on_its_own_seed_alone() -> None:
+@pytest.mark.parametrize("name", ["walker_params", "humanoid_dir"])
+def test_a_start_depends_on_its_own_seed_alone(name: str) -> None:
     """Also where others beside it end early and start again."""
-    env = MetaVectorEnv("walker_params", tasks=[5, 6, 7], autoreset_mode="SameStep")
+    env = MetaVectorEnv(name, tasks=[5, 6, 7], autoreset_mode="SameStep")
     starts = env.reset(seed=[1, 2, 3])[0]
     assert len(np.unique(starts, axis=0)) == 3
-    alone = MetaEnv("walker_params", task=6)
+    alone = MetaEnv(name, task=6)
     np.testing.assert_array_equal(alone.reset(seed=2)[0], starts[1])
     actions, resets = np.random.default_rng(0), 0
     for _ in range(60):
-        action = actions.uniform(-1.0, 1.0, (3, 6))
+        action = actions.uniform(-1.0, 1.0, (3, robot_of(name).nu))
         obs, _, terminated, _, _ = env.step(action)
         expected, _, over, _, _ = alone.step(action[1])
         if over:
             expected, resets = alone.reset()[0], resets + 1
         assert terminated[1] == over
         np.testing.assert_array_equal(obs[1], expected)
+        np.testing.assert_array_equal(env.state[1], alone.state)
     assert resets > 1
 
 

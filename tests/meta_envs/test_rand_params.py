@@ -47,7 +47,7 @@ def test_multipliers_are_in_their_ranges_and_named_after_the_model(name: str) ->
         *(f"dof_damping_{joint}" for joint in joints),
         *(f"geom_friction_{geom}_{kind}" for geom in geoms for kind in kinds),
     ]
-    for params in (tasks.params, tasks.sample(300, seed=2).params):
+    for params in (tasks.params, tasks.sample(seed=2, n_tasks=300).params):
         for field, size in SIZES[name].items():
             part = params[:, columns(name, field)]
             assert part.shape[1] == size
@@ -142,6 +142,21 @@ def test_with_nominal_parameters_it_is_gymnasiums(name: str, env_id: str, file: 
     assert 0 < ended < 60
 
 
+def test_a_robot_of_ones_own_is_nominal_but_for_what_is_changed() -> None:
+    robot, tasks = robot_of("hopper_params"), task_set("hopper_params")
+    own = dict.fromkeys(tasks.param_names, 1.0) | {"body_mass_torso": 2.0}
+    model = robot.task_model(tasks.with_params(own).params[0])
+    changed = {field for field in SIZES["hopper_params"] if field != "body_mass"}
+    for field in changed:
+        np.testing.assert_array_equal(getattr(model, field), getattr(robot.model, field))
+    expected = robot.model.body_mass.copy()
+    expected[1] *= 2.0
+    np.testing.assert_array_equal(model.body_mass, expected)
+    with pytest.raises(ValueError, match="hopper_params: task_params lacks ") as caught:
+        tasks.with_params({"body_mass_torso": 2.0})
+    assert len(str(caught.value)) < 400
+
+
 def test_observed_velocities_are_clipped() -> None:
     robot = robot_of("hopper_params")
     state = np.arange(18.0)[None] + 0.5
@@ -194,12 +209,12 @@ def test_where_an_episode_ends() -> None:
         assert over(walker, **changes) == expected, changes
 
 
-def test_staying_alive_is_worth_one_a_step() -> None:
+def test_staying_alive_without_moving_is_worth_200() -> None:
     for name in NAMES:
         robot = robot_of(name)
         state = robot.initial_state([np.random.default_rng(0)])
         reward, _ = robot.reward(state, np.zeros((1, robot.nu)), state, np.zeros((1, 1)))
-        assert reward.tolist() == [1.0]
+        assert (robot.horizon * reward).tolist() == [200.0]
 
 
 def test_random_actions_fall_at_once() -> None:

@@ -119,11 +119,20 @@ def test_an_environment_of_ones_own_is_like_the_others() -> None:
     assert "OwnRobot-v0" not in gymnasium.registry
 
 
-@pytest.mark.parametrize("taken", [{"name": "point_robot"}, {"id": "PointRobotWind-v0"}])
-def test_a_name_that_is_taken_is_refused_and_nothing_changes(taken: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [
+        ({"name": "point_robot"}, ValueError),
+        ({"id": "PointRobotWind-v0"}, ValueError),
+        ({"id": "Own Robot"}, gymnasium.error.Error),
+    ],
+)
+def test_a_name_that_cannot_be_is_refused_and_nothing_changes(
+    given: dict[str, Any], error: type[Exception]
+) -> None:
     before, known = dict(ENVIRONMENTS), set(gymnasium.registry)
     own = replace(ENVIRONMENTS["point_robot"], name="own_robot", id="OwnRobot-v0")
-    with pytest.raises(ValueError, match="there is an environment"):
-        register(replace(own, **taken))
+    with pytest.raises(error, match=r"there is an environment|Malformed environment ID"):
+        register(replace(own, **given))
     assert before == ENVIRONMENTS
     assert known == set(gymnasium.registry)

@@ -21,7 +21,7 @@ def test_the_multipliers_are_the_fields(name: str) -> None:
     np.testing.assert_allclose(values[[0, -1]], [4 / 9, 9 / 4], rtol=1e-12)
     np.testing.assert_allclose(values[1:] / values[:-1], 1.5 ** (4 / 39), rtol=1e-12)
     assert tasks.test_tasks.tolist() == list(range(2, 40, 4))
-    powers = np.log(tasks.sample(500, seed=1).params[:, 0]) / np.log(1.5)
+    powers = np.log(tasks.sample(seed=1, n_tasks=500).params[:, 0]) / np.log(1.5)
     assert -2.0 <= powers.min() < -1.95
     assert 1.95 < powers.max() <= 2.0
 

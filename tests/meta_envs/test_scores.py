@@ -46,7 +46,7 @@ def test_references_are_reproducible_and_of_the_tasks_given() -> None:
     other = reference_returns(tasks, episodes=20, seed=1)
     assert (other["random"] != first["random"]).all()
     np.testing.assert_array_equal(other["oracle"], first["oracle"])
-    fresh = tasks.sample(6, seed=0)
+    fresh = tasks.sample(seed=0, n_tasks=6)
     found = reference_returns(fresh, episodes=2)
     left = np.maximum(1.0 - (0.1 + fresh.params[:, 0]) * np.arange(1, 26)[:, None], 0.0)
     np.testing.assert_allclose(found["oracle"], -left.sum(axis=0), atol=1e-9)

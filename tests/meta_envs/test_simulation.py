@@ -1,4 +1,5 @@
 import copy
+import os
 import pickle
 import subprocess
 import sys
@@ -79,6 +80,30 @@ def test_without_native_threads_there_is_one_clear_sentence() -> None:
         "this environment needs MuJoCo 3.17 or newer, the first that steps many simulations on "
         'native threads (mujoco.batch): pip install "mujoco>=3.17"\n'
     )
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "ImportError: this environment needs MuJoCo 3.17 or newer"),
+        ("raise ImportError('initialization failed')", "ImportError: initialization failed"),
+        ("raise RuntimeError('broken')", "RuntimeError: broken"),
+    ],
+)
+def test_only_an_old_mujoco_is_called_old(content: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mujoco").mkdir()
+    (tmp_path / "mujoco" / "__init__.py").write_text(content)
+    code = "import gymnasium, meta_envs\ngymnasium.make('HopperRandParams-v0')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "MUJOCO_GL"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(message)
 
 
 @pytest.mark.parametrize("name", ["half_cheetah_vel", "walker_params", "ant_goal"])

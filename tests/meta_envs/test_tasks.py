@@ -1,5 +1,6 @@
 import copy
 import pickle
+import re
 from typing import Any
 
 import numpy as np
@@ -130,10 +131,10 @@ def test_a_task_set_keeps_its_own_copy() -> None:
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_fresh_tasks_depend_on_the_seed_alone(name: str) -> None:
     tasks = task_set(name)
-    fresh = tasks.sample(7, seed=3)
-    np.testing.assert_array_equal(fresh.params, tasks.sample(7, seed=3).params)
-    assert fresh.hash == tasks.sample(7, seed=3).hash
-    other = tasks.sample(7, seed=4).params
+    fresh = tasks.sample(seed=3, n_tasks=7)
+    np.testing.assert_array_equal(fresh.params, tasks.sample(seed=3, n_tasks=7).params)
+    assert fresh.hash == tasks.sample(seed=3, n_tasks=7).hash
+    other = tasks.sample(seed=4, n_tasks=7).params
     assert (other != fresh.params).any()
     # There are but two directions of the half-cheetah.
     assert np.isin(other, fresh.params).any() == (name == "half_cheetah_dir")
@@ -141,7 +142,7 @@ def test_fresh_tasks_depend_on_the_seed_alone(name: str) -> None:
     assert fresh.train_tasks.size == 0
     assert fresh.env == tasks.env
     assert fresh.param_names == tasks.param_names
-    assert fresh.sample(5, seed=1).hash == tasks.sample(5, seed=1).hash
+    assert fresh.sample(seed=1, n_tasks=5).hash == tasks.sample(seed=1, n_tasks=5).hash
 
 
 def largest_gap(sample: NDArray[np.float64], low: float, high: float) -> float:
@@ -154,12 +155,12 @@ def largest_gap(sample: NDArray[np.float64], low: float, high: float) -> float:
 def test_fresh_tasks_are_from_the_same_distribution() -> None:
     n = 4000
     limit = 1.95 / np.sqrt(n)  # exceeded once in a thousand samples
-    winds = task_set("point_robot_wind").sample(n, seed=0).params
+    winds = task_set("point_robot_wind").sample(seed=0, n_tasks=n).params
     assert largest_gap(winds[:, 0], -0.05, 0.05) < limit
     assert largest_gap(winds[:, 1], -0.05, 0.05) < limit
     assert abs(np.mean(winds[:, 0] * winds[:, 1])) < 3 * (0.1**2 / 12) / np.sqrt(n)
     for name in ("point_robot", "sparse_point_robot"):
-        goals = task_set(name).sample(n, seed=0).params
+        goals = task_set(name).sample(seed=0, n_tasks=n).params
         np.testing.assert_allclose(np.hypot(*goals.T), 1.0, atol=1e-12)
         assert largest_gap(np.arctan2(goals[:, 1], goals[:, 0]), 0.0, np.pi) < limit
 
@@ -184,6 +185,7 @@ def test_fresh_tasks_are_from_the_same_distribution() -> None:
             "e: test_tasks of split 'far' must be sorted rows between 0 and 2",
         ),
         ({"bounds": {"c": (0.0, 1.0)}}, r"e: no task parameter 'c' \(known: a, b\)"),
+        ({"choices": {"c": (0.0,)}}, r"e: no task parameter 'c' \(known: a, b\)"),
     ],
 )
 def test_a_faulty_task_set_is_refused(changes: dict[str, object], message: str) -> None:
@@ -203,7 +205,7 @@ def test_a_faulty_task_set_is_refused(changes: dict[str, object], message: str) 
 )
 def test_faulty_wishes_for_fresh_tasks_are_refused(n_tasks: int, seed: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        task_set("point_robot").sample(n_tasks, seed)
+        task_set("point_robot").sample(seed, n_tasks)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +239,7 @@ def test_every_task_set_has_the_default_split() -> None:
     assert list(tasks.splits) == ["interpolate"]
     assert tasks.splits["interpolate"].train_tasks.tolist() == tasks.train_tasks.tolist() == [0, 2]
     assert tasks.splits["interpolate"].test_tasks.tolist() == tasks.test_tasks.tolist() == [1]
-    assert list(tasks.sample(2, seed=0).splits) == ["interpolate"]
+    assert list(tasks.sample(seed=0, n_tasks=2).splits) == ["interpolate"]
 
 
 def test_a_split_need_not_hold_every_task() -> None:
@@ -257,16 +259,21 @@ def test_the_default_split_can_train_on_what_it_tests() -> None:
         small_set(test_tasks=rows(1), splits={"interpolate": both})
 
 
-def test_splits_and_bounds_cannot_be_written_to() -> None:
+def test_splits_bounds_and_choices_cannot_be_written_to() -> None:
     given = rows(1)
-    tasks = small_set(splits={"extrapolate": Split(given, rows(0))}, bounds={"a": (0.0, 9.0)})
+    tasks = small_set(
+        splits={"extrapolate": Split(given, rows(0))},
+        bounds={"a": (0.0, 9.0)},
+        choices={"b": (1.0, 3.0, 5.0)},
+    )
     given[:] = 2
     assert tasks.splits["extrapolate"].train_tasks.tolist() == [1]
     copied: Any
     for copied in (tasks, copy.deepcopy(tasks), pickle.loads(pickle.dumps(tasks))):
         assert copied.hash == tasks.hash
         assert copied.bounds == {"a": (0.0, 9.0)}
-        for mapping in (copied.splits, copied.bounds):
+        assert copied.choices == {"b": (1.0, 3.0, 5.0)}
+        for mapping in (copied.splits, copied.bounds, copied.choices):
             with pytest.raises(TypeError, match="does not support item assignment"):
                 mapping["a"] = 1
         arrays = [copied.params, copied.test_tasks]
@@ -305,7 +312,42 @@ def test_bounds_hold_for_every_task() -> None:
         tasks.with_params({"a": -0.1, "b": 9.0})
     assert tasks.with_params({"a": 4.0, "b": 9.0}).bounds == bounds
     with pytest.raises(ValueError, match="e: task parameter a must be between 0 and 4, got 7"):
-        small_set(bounds=bounds, sampler=lambda generator, n: np.full((n, 2), 7.0)).sample(1, 0)
+        small_set(bounds=bounds, sampler=lambda generator, n: np.full((n, 2), 7.0)).sample(
+            seed=0, n_tasks=1
+        )
+
+
+def test_a_parameter_with_choices_has_no_other_value() -> None:
+    choices = {"a": (0.0, 2.0, 4.0)}
+    tasks = small_set(choices=choices)
+    assert tasks.with_params({"a": 4, "b": 9.0}).choices == choices
+    message = "e: task parameter a must be 0 or 2 or 4, got 1"
+    with pytest.raises(ValueError, match=message):
+        tasks.with_params({"a": 1.0, "b": 9.0})
+    with pytest.raises(ValueError, match=message):
+        small_set(choices=choices, params=np.array([[0.0, 0.0], [1.0, 0.0]]))
+    sampled = small_set(choices=choices, sampler=lambda generator, n: np.full((n, 2), 1.0))
+    with pytest.raises(ValueError, match=message):
+        sampled.sample(seed=0, n_tasks=1)
+
+
+def test_of_one_task_it_is_said_that_there_is_no_other() -> None:
+    one = task_set("point_robot").with_params({"goal_x": 0.0, "goal_y": 1.0})
+    with pytest.raises(ValueError, match=r"^point_robot has only task 0 here, got task=3$"):
+        one.check_task(3)
+
+
+def test_of_many_parameters_a_message_lists_a_few() -> None:
+    names = tuple(f"p{number}" for number in range(10))
+    tasks = TaskSet("e", names, np.zeros((1, 10)), rows(0), uniform)
+    few = "p0, p1, p2, p3, p4, p5 and 4 more of TaskSet.param_names"
+    for given, message in (
+        ({"q": 1.0}, f"e: no task parameter 'q' (known: {few})"),
+        ({"p9": 1.0}, "e: task_params lacks p0, p1, p2, p3, p4, p5 and 3 more of "),
+        ({"p9": 1.0}, f" (needed: {few})"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            tasks.with_params(given)
 
 
 def test_tasks_of_ones_own() -> None:
@@ -319,7 +361,7 @@ def test_tasks_of_ones_own() -> None:
     two = tasks.with_params(others)
     assert two.params.tolist() == [[0.0, 1.0], [-1.0, 2.0]]
     assert two.test_tasks.tolist() == [0, 1]
-    assert one.sample(3, seed=1).hash == tasks.sample(3, seed=1).hash
+    assert one.sample(seed=1, n_tasks=3).hash == tasks.sample(seed=1, n_tasks=3).hash
 
 
 @pytest.mark.parametrize(

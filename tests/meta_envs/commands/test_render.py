@@ -48,6 +48,14 @@ def test_an_animation_shows_the_whole_episode(
     assert pause(file) == 100
 
 
+@needs_opengl
+def test_an_animation_is_no_faster_than_browsers_show_it(tmp_path: Path) -> None:
+    file = tmp_path / "hopper.gif"
+    assert main(["render", "hopper_mass", "--out", str(file)]) == 0
+    # Every third of its steps of 8 ms, in hundredths of a second.
+    assert pause(file) == 20
+
+
 def test_a_picture_is_the_last_of_the_episode(tmp_path: Path) -> None:
     gif, png = tmp_path / "robot.gif", tmp_path / "robot.png"
     for file in (gif, png):

@@ -201,6 +201,24 @@ class LooksAside(Sound):
         return moved
 
 
+class LooksAsideUnseen(Sound):
+    """As that, in a column of the state that neither observation nor reward shows."""
+
+    def initial_state(self, generators: Sequence[np.random.Generator]) -> Floats:
+        return np.pad(super().initial_state(generators), ((0, 0), (0, 1)))
+
+    def advance(self, state: Floats, action: Floats, params: Floats) -> Floats:
+        moved = super().advance(state[:, :2], action, params)
+        return np.pad(moved, ((0, 0), (0, 1)), constant_values=moved.sum())
+
+    def observe(self, state: Floats) -> NDArray[np.float32]:
+        return super().observe(state[:, :2])
+
+    def reward(self, *given: Floats) -> tuple[Floats, Terms]:
+        state, action, next_state, params = given
+        return super().reward(state[:, :2], action, next_state[:, :2], params)
+
+
 class StartsByChance(Sound):
     def initial_state(self, generators: Sequence[np.random.Generator]) -> Floats:
         return super().initial_state([_rng() for _ in generators])

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -48,6 +50,37 @@ def test_it_is_registered_no_longer_after_a_fault() -> None:
 )
 def test_what_cannot_be_checked_is_told_apart(env: str, message: str) -> None:
     with pytest.raises(ValueError, match=message), subject(env):
+        pass
+
+
+@pytest.mark.parametrize("env", ["robot.py:Robot", "a/robot:Robot", ":Robot", "robot:", "a:b:C"])
+def test_what_is_no_module_and_class_is_told_how_to_write_them(env: str) -> None:
+    message = f"^{env}: write module:Class, such as my_package.my_robot:MyRobot$"
+    with pytest.raises(ValueError, match=message), subject(env):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("def f(:", r"importing 'their_robot' ends in SyntaxError: .*\(their_robot.py, line 1\)"),
+        ("1 / 0", "importing 'their_robot' ends in ZeroDivisionError: division by zero"),
+        ("import absent_module", "there is no module 'absent_module' on Python's path"),
+    ],
+)
+def test_a_module_that_cannot_be_imported(
+    content: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "their_robot.py").write_text(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=f"^their_robot:Robot: {message}$"):
+        subject("their_robot:Robot").__enter__()
+
+
+def test_a_name_that_is_no_short_name_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Namesake, "name", "My Robot!")
+    named = "tests.meta_envs.conformance.test_subject:Namesake"
+    with pytest.raises(ValueError, match=r"its name .*, got 'My Robot!'"), subject(named):
         pass
 
 
