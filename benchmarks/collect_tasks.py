@@ -26,9 +26,10 @@ from rich.progress import track
 from rich.table import Table
 
 from datagen.budgets import BUDGETS, budget
+from datagen.collect_task import collect_task
 from datagen.estimate import seconds_a_learning_step, seconds_a_rollout
 from datagen.files import write_whole
-from datagen.job import Job, collect_task
+from datagen.job import Job
 from meta_envs import resolve
 
 

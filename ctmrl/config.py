@@ -12,6 +12,7 @@ from ctmrl.actor_critic import ActorCriticConfig
 from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods.base import MethodConfig
+from datagen.dataset import Quality
 
 Preset = Literal["standard", "paper", "smoke"]
 
@@ -58,6 +59,11 @@ class RunConfig:
     """Of everything random in the run."""
     data: Path | None = None
     """Dataset folder; default datasets/<environment>."""
+    quality: Quality = "mixed"
+    """Learn from the behaviour of these checkpoints alone: mixed (all), early, medium or expert;
+    docs/dataset_format.md defines them and python -m datagen.inspect counts them."""
+    data_episodes: int | None = None
+    """Learn from the first this many episodes of each checkpoint; default all."""
     out: Path | None = None
     """Run folder; default runs/<environment>/<method>/seed-<n>."""
     validate: bool = False
@@ -70,6 +76,16 @@ class RunConfig:
     tensorboard: bool = False
     """Also write TensorBoard events (needs the extra: pip install 'ctmrl[tensorboard]')."""
 
+    @property
+    def label(self) -> str:
+        """The method, and the slice of the data where that is not all of it: a report's rows."""
+        words = [self.method]
+        if self.quality != "mixed":
+            words.append(self.quality)
+        if self.data_episodes is not None:
+            words.append(f"{self.data_episodes}-episodes")
+        return "-".join(words)
+
 
 _SHARE = (0.0, 1.0)
 _BOUNDS: dict[str, tuple[float, float]] = {
@@ -81,6 +97,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("gamma", "target_rate", "eta", "warm_up", "refresh"), _SHARE),
     **dict.fromkeys(("reward_scale", "tau"), (1e-9, math.inf)),
     "code_decay": _SHARE,
+    "data_episodes": (1, math.inf),
     "meta_batch": (2, math.inf),
     "seed": (0, 2**63 - 1),
 }
@@ -100,7 +117,7 @@ def check_settings(config: Any) -> None:
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             check_settings(value)
-        elif field.name in _BOUNDS:
+        elif field.name in _BOUNDS and value is not None:
             low, high = _BOUNDS[field.name]
             numbers = value if isinstance(value, tuple) else (value,)
             if not all(low <= number <= high for number in numbers):

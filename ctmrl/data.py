@@ -66,24 +66,26 @@ class OfflineData:
         """Read the tasks.
 
         Args:
-            dataset: an open dataset.
+            dataset: an open dataset, or a slice of one.
             tasks: rows of the task set; nothing of other tasks is read.
             timeouts_as_terminals: treat the time limit as a real end, the field's habit.
             dense_context: on a sparse environment, let contexts see the dense reward.
 
         Raises:
-            DatasetError: a file is damaged.
+            DatasetError: a file is damaged, or a task has nothing in the slice.
         """
-        parts = [dataset.read(int(task)) for task in tasks]
         self.tasks = np.asarray(tasks, dtype=np.int64)
-        self.obs_dim = parts[0].columns["observations"].shape[1]
-        self.act_dim = parts[0].columns["actions"].shape[1]
+        self._part = dataset.part
+        tables, lengths = [], []
+        for task in tasks:
+            # One task's columns at a time: of the others there are only rows of the table.
+            data = dataset.read(int(task))
+            self.obs_dim, self.act_dim = data.observations.shape[1], data.actions.shape[1]
+            tables.append(_rows(data, timeouts_as_terminals, dense_context))
+            lengths.append(np.bincount(data.episode))
         self._layout = _Layout(self.obs_dim, self.act_dim)
-        self.table = torch.from_numpy(
-            np.concatenate([_rows(part, timeouts_as_terminals, dense_context) for part in parts])
-        )
-        lengths = [np.bincount(part.columns["episode"]) for part in parts]
-        self._task_rows = torch.tensor([len(part) for part in parts])
+        self.table = torch.from_numpy(np.concatenate(tables))
+        self._task_rows = torch.tensor([len(rows) for rows in tables])
         self._task_start = torch.cumsum(self._task_rows, 0) - self._task_rows
         self._task_episodes = torch.tensor([len(counts) for counts in lengths])
         self._task_first_episode = torch.cumsum(self._task_episodes, 0) - self._task_episodes
@@ -129,9 +131,10 @@ class OfflineData:
             UsageError: a task has fewer than sets * episodes episodes.
         """
         if sets * episodes > self.episodes:
+            where, more = ("dataset", "collect") if self._part.whole else ("slice", "ask for")
             raise UsageError(
-                f"contexts need {sets} x {episodes} different episodes a task, the dataset has "
-                f"{self.episodes}: collect more or lower --context-episodes"
+                f"contexts need {sets} x {episodes} different episodes a task, the {where} has "
+                f"{self.episodes}: {more} more or lower --context-episodes"
             )
 
     def contexts(

@@ -63,7 +63,7 @@ def evaluate_agent(
     references = reference_returns(tasks)
     record: dict[str, Any] = {
         "env": config.env,
-        "method": config.method,
+        "method": config.label,
         "seed": config.seed,
         "evaluation_seed": seed,
         "protocol": {

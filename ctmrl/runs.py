@@ -37,6 +37,10 @@ RUN_FILES = (
 )
 """All that a run's folder holds, in an order in which any beginning may be missing."""
 
+LATER_SETTINGS: dict[str, Any] = {"quality": "mixed", "data_episodes": None}
+"""Settings that came after the first runs, and what a run has that does not name them. Where they
+are this, config.json leaves them out: such a run is the same in every version, byte for byte."""
+
 
 class RunError(UsageError):
     """A run folder that cannot be used: which, why, and what to do."""
@@ -175,7 +179,8 @@ class RunFolder:
 
     def _compare(self, there: dict[str, Any], asked: dict[str, Any]) -> None:
         # Through JSON, because a tuple comes back as a list.
-        flat, wanted = flatten(there), flatten(json.loads(to_json(asked)))
+        unsaid = flatten({"settings": LATER_SETTINGS})
+        flat, wanted = (unsaid | flatten(one) for one in (there, json.loads(to_json(asked))))
         for key in sorted(flat.keys() | wanted.keys()):
             if flat.get(key) != wanted.get(key):
                 raise RunError(

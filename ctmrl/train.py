@@ -72,11 +72,14 @@ def settings_of(
     config: RunConfig, dataset: Dataset, split: Split, learner: Learner
 ) -> dict[str, Any]:
     """What config.json holds: all that decides the run's results."""
+    from ctmrl.runs import LATER_SETTINGS
+
     return {
         "settings": {
             key: value
             for key, value in dataclasses.asdict(config).items()
             if key not in NOT_SETTINGS
+            and not (key in LATER_SETTINGS and value == LATER_SETTINGS[key])
         },
         "dataset": dataset.hash,
         "groups": {"unseen": split.unseen.tolist(), "seen": split.train.tolist()},
@@ -87,7 +90,7 @@ def settings_of(
 
 
 def open_data(config: RunConfig) -> Dataset:
-    """Open the run's dataset.
+    """Open the run's slice of its dataset.
 
     Raises:
         UsageError: it is of another environment or has no training tasks.
@@ -108,7 +111,7 @@ def open_data(config: RunConfig) -> Dataset:
             f"{path} has {len(dataset.train_tasks)} training tasks, at least 2 are needed: "
             f"python -m datagen.collect --env {config.env} collects them"
         )
-    return dataset
+    return dataset.select(config.quality, config.data_episodes)
 
 
 def train(config: RunConfig, console: Console) -> dict[str, Any]:
@@ -153,7 +156,7 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
 
 def default_folder(config: RunConfig) -> Path:
     """runs/<env>/<method>/seed-<n>, beside it for runs that must not be mistaken for those."""
-    name = f"{config.method}-validation" if config.validate else config.method
+    name = f"{config.label}-validation" if config.validate else config.label
     return Path("runs") / config.env / name / f"seed-{config.seed}"
 
 

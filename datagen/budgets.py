@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 from meta_envs import resolve
 
@@ -33,6 +34,31 @@ class SACSettings:
     initial_temperature: float
 
 
+Precision = Literal["float32", "bfloat16"]
+"""Of a fleet's matrix products and what lies between them; parameters are always float32."""
+POINT_FLEET_SIZE = 50
+"""Tasks of a group where a fleet is asked for and the budget has none."""
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """How behaviour policies are trained side by side.
+
+    Attributes:
+        size: tasks of a group, at most; one process trains a group.
+        precision: of the matrix products; "auto", the hardware's best, is for budgets alone and
+            never for data.
+    """
+
+    size: int
+    precision: Precision | Literal["auto"]
+
+    def __post_init__(self) -> None:
+        """Check the size."""
+        if self.size < 1:
+            raise ValueError(f"a fleet has at least 1 task, got {self.size}")
+
+
 @dataclass(frozen=True)
 class Budget:
     """Everything that decides how one task's data are made, apart from the seed.
@@ -46,6 +72,7 @@ class Budget:
         episodes: stochastic episodes of each checkpoint.
         reference_episodes: episodes of the random policy behind its return.
         sac: how the policy learns.
+        fleet: how many learn at once; None for one process of Stable-Baselines3's SAC a task.
     """
 
     name: str
@@ -55,6 +82,7 @@ class Budget:
     episodes: int
     reference_episodes: int
     sac: SACSettings
+    fleet: FleetSettings | None = None
 
     def __post_init__(self) -> None:
         """Check that the numbers fit each other."""
@@ -63,6 +91,8 @@ class Budget:
             raise ValueError(f"checkpoints must rise from above {self.random_steps}, got {marks}")
         if marks[-1] > self.steps:
             raise ValueError(f"the last checkpoint, {marks[-1]}, is after {self.steps} steps")
+        if any(mark % self.sac.update_every for mark in marks):
+            raise ValueError(f"{marks} must be multiples of {self.sac.update_every}, the updates'")
         if self.episodes < 1:
             raise ValueError(f"episodes must be at least 1, got {self.episodes}")
 
@@ -80,6 +110,9 @@ class Budget:
         """All of it as JSON values, without the name."""
         values = asdict(self)
         del values["name"]
+        if self.fleet is None:
+            # As in datasets from before there were fleets.
+            del values["fleet"]
         values["checkpoints"] = list(self.checkpoints)
         values["sac"]["hidden"] = list(self.sac.hidden)
         return values
@@ -126,27 +159,91 @@ def _rows(paper: Budget) -> dict[str, Budget]:
     return {row.name: row for row in rows}
 
 
+_ROBOT_SAC = SACSettings(
+    hidden=(128, 128),
+    learning_rate=3e-4,
+    batch_size=256,
+    gamma=0.99,
+    tau=0.005,
+    update_every=20,
+    initial_temperature=1.0,
+)
+_ROBOT_STANDARD = Budget(
+    name="standard",
+    steps=40_000,
+    random_steps=2_000,
+    checkpoints=tuple(range(4_000, 40_000, 2_000)),
+    episodes=10,
+    reference_episodes=10,
+    sac=_ROBOT_SAC,
+    fleet=FleetSettings(25, "auto"),
+)
+_ROBOT_PAPER = Budget(
+    name="paper",
+    steps=1_000_000,
+    random_steps=50_000,
+    checkpoints=tuple(range(100_000, 1_000_000, 50_000)),
+    episodes=50,
+    reference_episodes=10,
+    sac=replace(_ROBOT_SAC, hidden=(1024, 1024), learning_rate=1e-4, batch_size=1024),
+    fleet=FleetSettings(10, "auto"),
+)
+_ROBOT_SMOKE = Budget(
+    name="smoke",
+    steps=400,
+    random_steps=200,
+    checkpoints=(300, 400),
+    episodes=2,
+    reference_episodes=2,
+    sac=replace(_ROBOT_SAC, hidden=(16, 16), batch_size=32),
+    fleet=FleetSettings(25, "auto"),
+)
+_ROBOT_ROWS = {row.name: row for row in (_ROBOT_PAPER, _ROBOT_STANDARD, _ROBOT_SMOKE)}
+_ROBOTS = (
+    "half_cheetah_vel",
+    "hopper_params",
+    "walker_params",
+    "ant_goal",
+    "half_cheetah_dir",
+    "ant_dir",
+    "humanoid_dir",
+    "hopper_mass",
+    "hopper_friction",
+    "walker_mass",
+    "walker_friction",
+)
+
 BUDGETS: dict[str, dict[str, Budget]] = {
     "point_robot": _rows(replace(_POINT_PAPER, sac=_GOAL_SAC)),
     "point_robot_wind": _rows(_POINT_PAPER),
     "sparse_point_robot": _rows(replace(_POINT_PAPER, sac=_GOAL_SAC)),
+    **dict.fromkeys(_ROBOTS, _ROBOT_ROWS),
 }
 """Budgets by the environment's short name and the budget's name."""
 
 
-def other_episodes(env: str, name: str, episodes: int) -> list[str]:
-    """The option for episodes that are not the budget's own, as words of a command, or none.
+def other_options(env: str, name: str, config: Mapping[str, Any]) -> list[str]:
+    """The options with which a command collects what a budget alone would not, as its words.
 
     Args:
         env: any of the environment's names.
         name: of the budget.
-        episodes: episodes of each checkpoint.
+        config: `Budget.config()` of the data.
 
     Raises:
         ValueError: there is no such environment or budget.
+        KeyError: the config lacks something.
+        TypeError: the config has something of another kind.
     """
-    own = budget(env, name).episodes
-    return [] if episodes == own else ["--episodes", str(episodes)]
+    own, episodes, fleet = budget(env, name), int(config["episodes"]), config.get("fleet")
+    words = [] if episodes == own.episodes else ["--episodes", str(episodes)]
+    if fleet is None:
+        return words if own.fleet is None else [*words, "--engine", "sb3"]
+    if own.fleet is None:
+        words += ["--engine", "fleet"]
+    if fleet["size"] != (own.fleet.size if own.fleet else POINT_FLEET_SIZE):
+        words += ["--fleet-size", str(fleet["size"])]
+    return [*words, "--precision", str(fleet["precision"])]
 
 
 def budget(env: str, name: str, episodes: int | None = None) -> Budget:

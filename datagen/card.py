@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from datagen.budgets import other_episodes
+from datagen.budgets import other_options
 from datagen.columns import COLUMNS
 from meta_envs import resolve, task_set
 from meta_envs.registry import definition
@@ -25,6 +25,15 @@ _COLUMN_MEANS = {
     "checkpoint": "training steps of the policy that acted",
     "dense_rewards": "dense reward of the step, which the behaviour policy learned from",
 }
+
+_COLLECTION_SETTINGS = (
+    "The behaviour policies are Stable-Baselines3's SAC. `datagen/budgets.py` says what each",
+    "setting is; what is not listed has Stable-Baselines3's default.",
+)
+_IMPORT_SETTINGS = (
+    "What the import found. The seed of the collection is unknown, which -1 stands for; the",
+    "versions are those of the import.",
+)
 
 
 def rows_text(tasks: Sequence[int]) -> str:
@@ -45,7 +54,7 @@ def remake_command(index: Mapping[str, Any]) -> str:
         index: content of `dataset.json`.
     """
     words = ["python", "-m", "datagen.collect", "--env", index["env"], "--budget", index["budget"]]
-    words += other_episodes(index["env"], index["budget"], index["config"]["episodes"])
+    words += other_options(index["env"], index["budget"], index["config"])
     tasks = [record["task"] for record in index["tasks"]]
     if len(tasks) < len(task_set(index["env"])):
         words += ["--tasks", rows_text(tasks)]
@@ -98,8 +107,9 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 def _front_matter(index: Mapping[str, Any], rows: int) -> list[str]:
     lines = [
         "---",
-        f"pretty_name: {index['env_id']} ({index['budget']}, seed {index['seed']})",
-        "license: mit",
+        f"pretty_name: {index['env_id']} ({_pretty(index)})",
+        # What somebody else collected is not ours to license.
+        f"license: {'unknown' if _is_legacy(index) else 'mit'}",
         "task_categories:",
         "- reinforcement-learning",
         "tags:",
@@ -117,15 +127,24 @@ def _front_matter(index: Mapping[str, Any], rows: int) -> list[str]:
     return [*lines, "---", ""]
 
 
+def _pretty(index: Mapping[str, Any]) -> str:
+    return "imported" if _is_legacy(index) else f"{index['budget']}, seed {index['seed']}"
+
+
 def _size_category(rows: int) -> str:
     bounds = [(10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M")]
-    return next((name for bound, name in bounds if rows < bound), "1M<n<10M")
+    bounds += [(10**7, "1M<n<10M"), (10**8, "10M<n<100M")]
+    return next((name for bound, name in bounds if rows < bound), "100M<n<1B")
+
+
+def _is_legacy(index: Mapping[str, Any]) -> bool:
+    """Whether `datagen.exchange from-legacy` made the dataset."""
+    return bool(index["config"].get("source") == "legacy")
 
 
 def _about(index: Mapping[str, Any]) -> list[str]:
     env, records = index["env"], index["tasks"]
-    row, config = resolve(env), index["config"]
-    marks = config["checkpoints"]
+    row = resolve(env)
     names = ", ".join(f"`{name}`" for name in index["param_names"])
     expert = (
         "the exact optimum"
@@ -139,6 +158,16 @@ def _about(index: Mapping[str, Any]) -> list[str]:
         f"What varies from task to task: {row.varies} (parameters {names}). "
         f"An episode has at most {row.horizon} steps.",
         "",
+        *(_import_text(index) if _is_legacy(index) else _collection_text(index)),
+        f"Returns are undiscounted sums of `rewards`, means over tasks; the expert is {expert}.",
+        "",
+    ]
+
+
+def _collection_text(index: Mapping[str, Any]) -> list[str]:
+    config = index["config"]
+    marks = config["checkpoints"]
+    return [
         "On each task one soft actor-critic was trained from scratch. At each of "
         f"{len(marks)} checkpoints, after {marks[0]:,} to {marks[-1]:,} environment steps, its "
         f"stochastic policy played {config['episodes']} episodes. The data are a mixture of poor, "
@@ -150,7 +179,30 @@ def _about(index: Mapping[str, Any]) -> list[str]:
         remake_command(index),
         "```",
         "",
-        f"Returns are undiscounted sums of `rewards`, means over tasks; the expert is {expert}.",
+    ]
+
+
+def _import_text(index: Mapping[str, Any]) -> list[str]:
+    config = index["config"]
+    marks = config["checkpoints"]
+    verified = (
+        "Every step was computed anew from the task's parameters and agrees."
+        if config["tasks_verified"]
+        else "That its tasks are those of the environment here is taken on trust: they were "
+        "matched by their numbers."
+    )
+    deterministic = (
+        "Deterministic returns are those of its deterministic episodes."
+        if config["deterministic_known"]
+        else "It had no deterministic episodes; the deterministic returns repeat the stochastic "
+        "ones."
+    )
+    return [
+        "Imported by `python -m datagen.exchange from-legacy` from a folder of the field's older "
+        f"format, with the episodes of {len(marks)} checkpoints after {marks[0]:,} to "
+        f"{marks[-1]:,} training steps. {verified} {deterministic} Which learner, simulator, seed "
+        "and versions made it is unknown, and so is why an episode ended: one shorter than the "
+        "time limit ends in a terminal where tasks of this environment can end by themselves.",
         "",
     ]
 
@@ -226,15 +278,14 @@ def _columns_table(index: Mapping[str, Any]) -> list[str]:
 
 def _settings_tables(index: Mapping[str, Any]) -> list[str]:
     config = dict(index["config"])
-    learner = config.pop("sac")
+    learner = config.pop("sac", {})
     settings = [*sorted({**config, "seed": index["seed"]}.items()), *sorted(learner.items())]
     shown = [[f"`{key}`", _setting(value)] for key, value in settings]
     versions = [[name, version] for name, version in sorted(index["versions"].items())]
     return [
         "## Settings",
         "",
-        "The behaviour policies are Stable-Baselines3's SAC. `datagen/budgets.py` says what each",
-        "setting is; what is not listed has Stable-Baselines3's default.",
+        *(_IMPORT_SETTINGS if _is_legacy(index) else _COLLECTION_SETTINGS),
         "",
         *_table(["setting", "value"], shown),
         "",
@@ -249,7 +300,11 @@ def _settings_tables(index: Mapping[str, Any]) -> list[str]:
 def _setting(value: object) -> str:
     if isinstance(value, list):
         return ", ".join(map(str, value))
-    return f"{value:,}" if isinstance(value, int) else str(value)
+    if isinstance(value, Mapping):
+        # In an order of its own: an index that was read has another than one that was just made.
+        return ", ".join(f"{key} {_setting(part)}" for key, part in sorted(value.items()))
+    plain = isinstance(value, bool) or not isinstance(value, int)
+    return str(value) if plain else f"{value:,}"
 
 
 def card(index: Mapping[str, Any]) -> str:

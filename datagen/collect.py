@@ -9,17 +9,18 @@ import dataclasses
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Protocol, TypeVar
 
 import tyro
 from rich.console import Console
 
-from datagen.budgets import budget
+from datagen.budgets import POINT_FLEET_SIZE, Budget, FleetSettings, budget
 from datagen.card import rows_text
+from datagen.collect_task import collect_task
 from datagen.dataset import task_file
 from datagen.estimate import seconds_of
 from datagen.finished import (
@@ -29,10 +30,10 @@ from datagen.finished import (
     without_versions,
     write_summary,
 )
-from datagen.job import Job, collect_task, origin
+from datagen.job import Job, group_file, origin
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration
-from datagen.workers import WorkerError, run_jobs
+from datagen.workers import Event, WorkerError, run_jobs
 from meta_envs import resolve, task_set
 
 MOST_WORKERS = 8
@@ -62,6 +63,21 @@ class CollectConfig:
     """The dataset's folder; datasets/ENV by default."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Processes, one thread each; by default one a core, 8 at most."""
+    engine: Annotated[Literal["fleet", "sb3"] | None, tyro.conf.arg(metavar="fleet|sb3")] = None
+    """What trains the behaviour policies: a fleet learns many tasks side by side in one process,
+    sb3 is Stable-Baselines3's SAC, a process a task. By default sb3 for point robots, and a fleet
+    for MuJoCo."""
+    fleet_size: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Tasks a fleet learns side by side, at most; a setting of the budget by default."""
+    precision: Annotated[
+        Literal["auto", "float32", "bfloat16"], tyro.conf.arg(metavar="auto|float32|bfloat16")
+    ] = "auto"
+    """Of a fleet's matrix products: bfloat16 where the hardware has them, by default."""
+    device: str = "cpu"
+    """Where a fleet learns, such as cpu or cuda."""
+    policies: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Also write the last policy of every task a fleet has trained to this folder, as a file that
+    stable_baselines3.SAC.load opens."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Episodes of each checkpoint, instead of the budget's, for a smaller dataset."""
     dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -87,7 +103,7 @@ def plan_of(config: CollectConfig) -> Plan:
         ValueError: an option is wrong; the message says which and how to do better.
     """
     env = resolve(config.env).name
-    wanted = budget(env, config.budget, config.episodes)
+    wanted = with_engine(budget(env, config.budget, config.episodes), config)
     tasks = parse_shard(config.shard, parse_tasks(config.tasks, task_set(env)))
     if config.seed < 0:
         raise ValueError(f"--seed must not be negative, got {config.seed}")
@@ -96,7 +112,40 @@ def plan_of(config: CollectConfig) -> Plan:
     if workers < 1:
         raise ValueError(f"--workers must be at least 1, got {workers}")
     folder = config.out or Path("datasets") / env
-    return Plan(env, tasks, wanted, config.seed, folder, workers)
+    return Plan(env, tasks, wanted, config.seed, folder, workers, config.device, config.policies)
+
+
+def with_engine(budget: Budget, config: CollectConfig) -> Budget:
+    """A budget with the engine a command line asks for.
+
+    Raises:
+        ValueError: an option is wrong, or of the other engine.
+    """
+    fleet = budget.fleet
+    if config.engine == "sb3":
+        fleet = None
+    elif config.engine == "fleet" and fleet is None:
+        fleet = FleetSettings(POINT_FLEET_SIZE, "auto")
+    if fleet is None:
+        for name, value, default in (
+            ("fleet-size", config.fleet_size, None),
+            ("precision", config.precision, "auto"),
+            ("device", config.device, "cpu"),
+            ("policies", config.policies, None),
+        ):
+            if value != default:
+                raise ValueError(f"--{name} is for fleets: give --engine fleet with it")
+        return replace(budget, fleet=None)
+    if config.fleet_size is not None:
+        if config.fleet_size < 1:
+            raise ValueError(f"--fleet-size must be at least 1, got {config.fleet_size}")
+        fleet = replace(fleet, size=config.fleet_size)
+    # Loads torch, which --help and mistakes need not wait for.
+    from datagen.fleet.networks import check_precision
+
+    return replace(
+        budget, fleet=replace(fleet, precision=check_precision(config.precision, config.device))
+    )
 
 
 def missing_tasks(plan: Plan) -> tuple[int, ...]:
@@ -132,25 +181,37 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
         InterruptedCollectionError: Ctrl-C.
     """
     _prepare(plan.folder)
+    if plan.policies is not None:
+        _prepare(plan.policies, "--policies")
     missing = missing_tasks(plan)
     finished = len(plan.tasks) - len(missing)
     if finished:
         console.print(f"{finished} of {len(plan.tasks)} tasks are already finished.")
-    jobs = [Job(plan.env, task, plan.budget, plan.seed, plan.folder) for task in missing]
-    with CollectionDisplay(console, len(plan.tasks), len(jobs), plan.budget) as display:
+    jobs = [
+        Job(plan.env, task, plan.budget, plan.seed, plan.folder, group, plan.policies)
+        for group in plan.groups
+        for task in group
+    ]
+    wanted = [job for job in jobs if job.task in missing]
+    with CollectionDisplay(console, len(plan.tasks), len(wanted), plan.budget) as display:
         try:
-            _run(jobs, plan.workers, display)
+            if plan.budget.fleet:
+                _train(jobs, wanted, plan, display)
+            _run(wanted, plan.workers, display)
         except KeyboardInterrupt:
             raise InterruptedCollectionError(_done(plan), len(plan.tasks)) from None
         except WorkerError as error:
             raise CollectionError(
-                f"task {jobs[error.index].task}: {error}; {_done(plan)} of "
-                f"{len(plan.tasks)} tasks are done, and the same command continues"
+                f"{error}; {_done(plan)} of {len(plan.tasks)} tasks are done, and the same "
+                "command continues"
             ) from None
         finally:
             remove_stale(plan.folder)
     try:
-        return write_summary(plan.folder, origin(plan.env, plan.budget, plan.seed))
+        index = write_summary(plan.folder, origin(plan.env, plan.budget, plan.seed))
+        for group in plan.groups:
+            group_file(plan.folder, group).unlink(missing_ok=True)
+        return index
     except OSError as error:
         raise CollectionError(
             f"all tasks are done, but not the index ({error}); the same command continues"
@@ -162,28 +223,70 @@ def _done(plan: Plan) -> int:
     return sum((plan.folder / task_file(task)).exists() for task in plan.tasks)
 
 
-def _prepare(folder: Path) -> None:
+def _prepare(folder: Path, option: str = "--out") -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(
-            f"--out {folder} cannot be made ({error.strerror}), choose another"
+            f"{option} {folder} cannot be made ({error.strerror}), choose another"
         ) from None
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(f"--out {folder} cannot be written to, choose another")
+        raise ValueError(f"{option} {folder} cannot be written to, choose another")
     remove_stale(folder)
 
 
+def _train(
+    jobs: Sequence[Job], wanted: Sequence[Job], plan: Plan, display: CollectionDisplay
+) -> None:
+    """Train the groups of all wanted tasks, as far as that has not been done."""
+    from datagen.fleet.training import FleetJob, train_fleet
+
+    groups = {job.group for job in wanted}
+    fleets = [
+        FleetJob(tuple(job for job in jobs if job.group == group), plan.device)
+        for group in plan.groups
+        if group in groups
+    ]
+    for fleet, event in _events(train_fleet, fleets, plan.workers):
+        if event.kind == "started":
+            display.started(fleet.tasks)
+        elif event.kind == "done":
+            display.trained(fleet.tasks)
+        elif isinstance(event.value, int):
+            display.step(fleet.tasks, event.value)
+
+
 def _run(jobs: Sequence[Job], workers: int, display: CollectionDisplay) -> None:
-    with closing(run_jobs(collect_task, jobs, workers)) as events:
-        for event in events:
-            task = jobs[event.index].task
-            if event.kind == "started":
-                display.started(task)
-            elif isinstance(event.value, int):
-                display.step(task, event.value)
-            elif event.value is not None:
-                display.done(task, event.value)
+    for job, event in _events(collect_task, jobs, workers):
+        if event.kind == "started":
+            display.started(job.tasks)
+        elif isinstance(event.value, int):
+            display.step(job.tasks, event.value)
+        elif event.value is not None:
+            display.done(job.task, event.value)
+
+
+class _HasTasks(Protocol):
+    @property
+    def tasks(self) -> tuple[int, ...]: ...
+
+
+J = TypeVar("J", bound=_HasTasks)
+R = TypeVar("R")
+
+
+def _events(
+    work: Callable[[J, Callable[[int], None]], R], jobs: Sequence[J], workers: int
+) -> Iterator[tuple[J, Event[R]]]:
+    """Run jobs on workers; each event with its job, and a failure with its tasks' numbers."""
+    try:
+        with closing(run_jobs(work, jobs, workers)) as events:
+            for event in events:
+                yield jobs[event.index], event
+    except WorkerError as error:
+        where = rows_text(jobs[error.index].tasks)
+        noun = "task" if len(jobs[error.index].tasks) == 1 else "tasks"
+        raise WorkerError(error.index, f"{noun} {where}: {error}") from None
 
 
 def describe(plan: Plan, console: Console) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.budgets import Budget
+from datagen.job import Job
 from datagen.plan import Plan
 from datagen.rollout import rollout
 from meta_envs.registry import definition
@@ -58,6 +59,23 @@ def seconds_a_learning_step(env: str, budget: Budget) -> float:
     return watch.seconds_a_step()
 
 
+def seconds_a_fleet_step(plan: Plan) -> float:
+    """Measured seconds of one environment step and one update of all tasks of a group."""
+    from datagen.fleet.training import FleetJob, Reports, learner
+
+    random_steps = 2 * plan.budget.sac.update_every
+    watch = _Stopwatch(2 * random_steps)
+    endless = dataclasses.replace(
+        plan.budget, steps=10**5, random_steps=random_steps, checkpoints=(10**5,)
+    )
+    group = plan.groups[0]
+    jobs = tuple(Job(plan.env, task, endless, 0, plan.folder, group) for task in group)
+    model = learner(FleetJob(jobs, plan.device))
+    with suppress(_EnoughError):
+        model.learn(10**5 * len(group), Reports(watch.report, plan.budget.sac.update_every))
+    return watch.seconds_a_step()
+
+
 def seconds_a_rollout(env: str, episodes: int) -> float:
     """Measured seconds of one checkpoint's episodes."""
 
@@ -73,7 +91,10 @@ def seconds_a_rollout(env: str, episodes: int) -> float:
 def seconds_of(plan: Plan) -> float:
     """About how long the tasks of a plan take, all of them, its workers side by side."""
     budget = plan.budget
-    task = budget.updates * seconds_a_learning_step(plan.env, budget)
-    task += len(budget.checkpoints) * seconds_a_rollout(plan.env, budget.episodes)
-    turns = -(-len(plan.tasks) // plan.workers)
-    return START_SECONDS + turns * task
+    if budget.fleet:
+        update, jobs = seconds_a_fleet_step(plan), len(plan.groups)
+    else:
+        update, jobs = seconds_a_learning_step(plan.env, budget), len(plan.tasks)
+    learning = budget.updates * update * -(-jobs // plan.workers)
+    rollouts = len(budget.checkpoints) * seconds_a_rollout(plan.env, budget.episodes)
+    return START_SECONDS + learning + rollouts * -(-len(plan.tasks) // plan.workers)

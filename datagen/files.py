@@ -13,11 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from datagen.budgets import other_episodes
+from datagen.budgets import other_options
 from meta_envs import resolve
 
 INDEX_FILE = "dataset.json"
 """Name of a dataset's index, beside its task files."""
+
+IMPORTED = "legacy"
+"""What the index of an imported dataset has for a budget."""
 
 
 class DatasetError(ValueError):
@@ -65,21 +68,24 @@ def collect_command(folder: Path, source: Mapping[str, Any], task: int | None = 
         task: the one task to collect; all by default.
     """
     env = _short_name(source.get("env")) or _short_name(folder.absolute().name) or "ENVIRONMENT"
+    if source.get("budget") == IMPORTED:
+        words = ["python", "-m", "datagen.exchange", "from-legacy", "FOLDER", "--env", env]
+        return shlex.join([*words, "--out", str(folder)])
     words = ["python", "-m", "datagen.collect", "--env", env]
     if task is not None:
         words += ["--tasks", str(task)]
     for key in ("budget", "seed"):
         if isinstance(source.get(key), str | int):
             words += [f"--{key}", str(source[key])]
-    words += _thinning(env, source)
+    words += _other_options(env, source)
     return shlex.join([*words, "--out", str(folder)])
 
 
-def _thinning(env: str, source: Mapping[str, Any]) -> list[str]:
-    """The option that repeats other episodes than the budget's, where both are known."""
+def _other_options(env: str, source: Mapping[str, Any]) -> list[str]:
+    """The options that repeat what is not the budget's own, where both are known."""
     try:
-        return other_episodes(env, source["budget"], int(source["config"]["episodes"]))
-    except (KeyError, TypeError, ValueError):
+        return other_options(env, source["budget"], source["config"])
+    except (AttributeError, KeyError, TypeError, ValueError):
         return []
 
 
@@ -199,10 +205,10 @@ def write_whole(path: Path, content: bytes) -> None:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Make a rename in the folder last through a power cut, where the system has a way to."""
     if os.name != "posix":
         return

@@ -1,8 +1,12 @@
-"""The bytes of a task's file: columns and meta to HDF5 and back, in memory."""
+"""The bytes of a task's file: columns and meta to HDF5 and back, in memory or part by part."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BufferedReader
 from typing import Any
 
 import h5py
@@ -14,6 +18,8 @@ from datagen.files import canonical_json, parse_canonical
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of every HDF5 file."""
+_HEAD = 48
+"""Bytes of the superblock, with which every HDF5 file of the present generation begins."""
 # This generation of the file format guards all of its own structures by checksums, so that damage
 # is found by the library instead of being followed. Every HDF5 since 1.8 reads it.
 _LIBRARY_VERSION = ("v108", "v108")
@@ -42,41 +48,106 @@ def decode(content: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     Raises:
         ValueError: what is wrong with the file.
     """
-    _check_length(content)
-    try:
-        with h5py.File(h5py.h5f.open_file_image(content, flags=_IN_PLACE)) as file:
-            fault = _structure_fault(file)
-            if not fault:
-                columns = {name: file[name][...] for name in COLUMNS if name in file}
-                text = bytes(file.attrs["meta"])
-    except Exception as error:  # on damaged files h5py raises exceptions of nearly every type
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"is damaged inside, HDF5 cannot read it ({reason})") from error
+    _check_length(content, len(content))
+    with _readable(), h5py.File(h5py.h5f.open_file_image(content, flags=_IN_PLACE)) as file:
+        fault = _structure_fault(file)
+        if not fault:
+            columns = {name: file[name][...] for name in COLUMNS if name in file}
+            text = bytes(file.attrs["meta"])
     if fault:
         raise ValueError(fault)
+    return columns, _parse_meta(text)
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnFile:
+    """An open HDF5 file of columns, of which parts can be read; made by `opened`.
+
+    Attributes:
+        meta: content of the attribute of this name.
+        columns: the columns on the disk, by name.
+    """
+
+    meta: dict[str, Any]
+    columns: dict[str, h5py.Dataset]
+
+    def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Rows start to stop of a column.
+
+        Raises:
+            ValueError: HDF5 cannot read them.
+        """
+        with _readable():
+            values: NDArray[Any] = self.columns[name][start:stop]
+            return values
+
+
+@contextmanager
+def opened(handle: BufferedReader) -> Iterator[ColumnFile]:
+    """Open an HDF5 file of columns without reading them; opens no other file.
+
+    Args:
+        handle: the file, open for reading; it stays open.
+
+    Raises:
+        ValueError: what is wrong with the file.
+    """
+    handle.seek(0)
+    _check_length(handle.read(_HEAD), os.fstat(handle.fileno()).st_size)
+    with _readable():
+        file = h5py.File(handle, "r")
+    with file:
+        with _readable():
+            fault = _structure_fault(file)
+            text = b"" if fault else bytes(file.attrs["meta"])
+        if fault:
+            raise ValueError(fault)
+        yield ColumnFile(_parse_meta(text), {name: file[name] for name in COLUMNS if name in file})
+
+
+@contextmanager
+def _readable() -> Iterator[None]:
+    """Turn what HDF5 raises on damaged files, exceptions of nearly every type, into a ValueError.
+
+    Raises:
+        ValueError: it cannot read the file.
+    """
     try:
-        return columns, parse_canonical(text)
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"is damaged inside, HDF5 cannot read it ({reason})") from error
+
+
+def _parse_meta(text: bytes) -> dict[str, Any]:
+    try:
+        return parse_canonical(text)
     except ValueError as error:
         raise ValueError(f"its attribute 'meta' {error}") from error
 
 
-def _check_length(content: bytes) -> None:
-    """Compare the length with the one the file itself states, before HDF5 looks at it."""
-    if not content:
+def _check_length(content: bytes, size: int) -> None:
+    """Compare the length with the one the file itself states, before HDF5 looks at it.
+
+    Args:
+        content: the file, or its beginning.
+        size: of the whole file in bytes.
+    """
+    if not size:
         raise ValueError("is empty")
     if not content.startswith(SIGNATURE):
         raise ValueError("is not an HDF5 file")
-    if len(content) < 48:
-        raise ValueError(f"is truncated to {len(content)} bytes")
+    if size < _HEAD:
+        raise ValueError(f"is truncated to {size} bytes")
     # Superblock versions 2 and 3: version, sizes of addresses and lengths, flags, then three
     # addresses, of which the third is that of the end of the file.
     if content[8] not in (2, 3) or content[9] != 8:
         return
     stated = int.from_bytes(content[28:36], "little")
-    if len(content) < stated:
-        raise ValueError(f"is truncated to {len(content)} of its {stated} bytes")
-    if len(content) > stated:
-        raise ValueError(f"has {len(content) - stated} foreign bytes behind its end")
+    if size < stated:
+        raise ValueError(f"is truncated to {size} of its {stated} bytes")
+    if size > stated:
+        raise ValueError(f"has {size - stated} foreign bytes behind its end")
 
 
 def _structure_fault(file: h5py.File) -> str:

@@ -11,13 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from datagen.card import mean_returns, named_checkpoints
-from datagen.dataset import Dataset, open_dataset
+from datagen.dataset import QUALITIES, Dataset, Episodes, Quality, open_dataset
+from datagen.slices import chosen_checkpoints
 from meta_envs import normalized_score
 
 PLAIN_WIDTH = 140
@@ -75,6 +77,65 @@ def returns_table(dataset: Dataset) -> Table:
     return table
 
 
+def slices_table(dataset: Dataset) -> Table:
+    """A row for each quality: what `select` and `--quality` give of a dataset.
+
+    Raises:
+        DatasetError: a file is missing or damaged.
+    """
+    episodes = {int(task): dataset.episodes(int(task)) for task in dataset.tasks}
+    table = Table(
+        title="Slices, by quality of the behaviour policy",
+        caption="docs/dataset_format.md defines them. Returns are means over checkpoints, then "
+        "tasks; score: of that return, with random 0 and expert 100.",
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+    )
+    table.add_column("slice")
+    headings = ("tasks", "rows", "episodes", "checkpoints\nof a task", "episodes of\na checkpoint")
+    for heading in (*headings, "return", "score"):
+        table.add_column(heading, justify="right")
+    for quality in QUALITIES:
+        table.add_row(quality, *_slice_cells(dataset, episodes, quality))
+    return table
+
+
+def _slice_cells(dataset: Dataset, episodes: Mapping[int, Episodes], quality: Quality) -> list[str]:
+    """What a slice holds of all tasks, as text."""
+    rows, counts, returns = 0, [], []
+    records = dataset.index["tasks"]
+    for record in records:
+        one, all_returns = episodes[record["task"]], record["returns"]
+        chosen = chosen_checkpoints(all_returns, quality)
+        inside = np.isin(one.checkpoints, chosen)
+        if not inside.any():
+            continue
+        rows += int(one.lengths[inside].sum())
+        counts.append(np.unique(one.checkpoints[inside], return_counts=True)[1])
+        by_checkpoint = {int(mark): value for mark, value in all_returns["behavior"].items()}
+        mean = float(np.mean([by_checkpoint[mark] for mark in chosen]))
+        returns.append((all_returns["random"], mean, all_returns["expert"]))
+    if not counts:
+        return [f"0 of {len(records)}", "0", "0", *["-"] * 4]
+    random, mean, expert = np.mean(returns, axis=0)
+    return [
+        f"{len(counts)} of {len(records)}",
+        f"{rows:,}",
+        f"{sum(int(part.sum()) for part in counts):,}",
+        _span([len(part) for part in counts]),
+        _span(np.concatenate(counts).tolist()),
+        f"{mean:.2f}",
+        f"{normalized_score(mean, random, expert):.1f}",
+    ]
+
+
+def _span(values: Sequence[int]) -> str:
+    """Least and largest of some numbers, or the one they all are."""
+    low, high = min(values), max(values)
+    return str(low) if low == high else f"{low}-{high}"
+
+
 def params_text(params: Sequence[float]) -> str:
     """The first few parameters of a task, for people."""
     shown = ", ".join(f"{value:.3f}" for value in params[:MOST_PARAMS])
@@ -113,7 +174,9 @@ def inspect(config: InspectConfig, console: Console) -> None:
     if config.plot is not None:
         check_picture(config.plot)
     dataset = open_dataset(config.path, verify=False)
-    console.print(returns_table(dataset))
+    tables = returns_table(dataset), slices_table(dataset)
+    for table in tables:
+        console.print(table)
     size = sum(record["bytes"] for record in dataset.index["tasks"])
     _say(console, f"{config.path}: {size / 1e6:.1f} MB, SHA-256 {dataset.hash[:16]}")
     _say(console, f"whether it is intact: python -m datagen.check {config.path}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from datagen.budgets import Budget
@@ -27,6 +28,8 @@ class Plan:
         seed: of the dataset.
         folder: the dataset's.
         workers: processes at most.
+        device: where a fleet learns, torch's name for it.
+        policies: folder for a fleet's last policies as files of Stable-Baselines3's, or None.
     """
 
     env: str
@@ -35,6 +38,16 @@ class Plan:
     seed: int
     folder: Path
     workers: int
+    device: str = "cpu"
+    policies: Path | None = None
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """The tasks in groups that are trained side by side; each alone without a fleet."""
+        size = self.budget.fleet.size if self.budget.fleet else 1
+        count = -(-len(self.tasks) // size)
+        bounds = [len(self.tasks) * part // count for part in range(count + 1)]
+        return tuple(self.tasks[a:b] for a, b in pairwise(bounds))
 
     @property
     def rows(self) -> int:

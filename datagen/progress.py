@@ -12,6 +12,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from datagen.budgets import Budget
 
+FLEET_ROLLOUTS = 0.2
+"""About the part of a fleet's collection that comes after its training; only estimates use it."""
+
 
 class TimeLeft:
     """Estimate of the time a collection still needs, from the updates done so far.
@@ -35,7 +38,8 @@ class TimeLeft:
 
     def step(self, task: int, step: int) -> None:
         """A task is at a training step."""
-        self._parts[task] = max(0.0, (step - self._budget.random_steps) / self._budget.updates)
+        part = max(0.0, (step - self._budget.random_steps) / self._budget.updates)
+        self._parts[task] = part * (1.0 - FLEET_ROLLOUTS if self._budget.fleet else 1.0)
 
     def done(self, task: int) -> None:
         """A task is finished."""
@@ -105,23 +109,31 @@ class CollectionDisplay:
         if self._progress:
             self._progress.stop()
 
-    def started(self, task: int) -> None:
-        """A worker has taken a task."""
-        self._starts[task] = time.monotonic()
+    def started(self, tasks: tuple[int, ...]) -> None:
+        """A worker has taken a task, or a group of them to train."""
+        for task in tasks:
+            self._starts[task] = time.monotonic()
         if self._progress:
-            self._bars[task] = self._progress.add_task(
-                f"task {task}", total=self._budget.checkpoints[-1], note="starting"
+            name = f"task {tasks[0]}" if len(tasks) == 1 else f"tasks {tasks[0]} to {tasks[-1]}"
+            self._bars[tasks[0]] = self._progress.add_task(
+                name, total=self._budget.checkpoints[-1], note="starting"
             )
 
-    def step(self, task: int, step: int) -> None:
-        """A task's training is at this step."""
-        self._left.step(task, step)
+    def step(self, tasks: tuple[int, ...], step: int) -> None:
+        """The training of these tasks is at this step of each."""
+        for task in tasks:
+            self._left.step(task, step)
         if self._progress:
             note = "random steps" if step <= self._budget.random_steps else "learning"
             if step >= self._budget.checkpoints[-1]:
                 note = "rolling out"
-            self._progress.update(self._bars[task], completed=step, note=note)
+            self._progress.update(self._bars[tasks[0]], completed=step, note=note)
             self._show_overall()
+
+    def trained(self, tasks: tuple[int, ...]) -> None:
+        """A group is trained; its tasks are rolled out next, each alone."""
+        if self._progress:
+            self._progress.remove_task(self._bars.pop(tasks[0]))
 
     def done(self, task: int, returns: dict[str, Any]) -> None:
         """A task's file is written; `returns` are those of its meta."""

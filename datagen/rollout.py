@@ -43,7 +43,9 @@ def rollout(
     """
     # In this mode a finished sub-environment first returns the state it ended in. It then plays
     # on, unrecorded, until the longest episode is over.
-    many = MetaVectorEnv(env, tasks=[task] * episodes, autoreset_mode=AutoresetMode.NEXT_STEP)
+    many = MetaVectorEnv(
+        env, tasks=[task] * episodes, autoreset_mode=AutoresetMode.NEXT_STEP, threads=1
+    )
     seeds = range(episodes) if generator is None else generator.integers(2**31, size=episodes)
     obs, _ = many.reset(seed=[int(seed) for seed in seeds])
     running = np.ones(episodes, dtype=np.bool_)

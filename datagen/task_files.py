@@ -41,7 +41,7 @@ def write_task(path: Path, data: TaskData) -> None:
     try:
         meta = parse_canonical(canonical_json(data.meta).encode())
         meta["format_version"] = FORMAT_VERSION
-        _check_task_data(TaskData(data.task, data.columns, meta))
+        check_task_data(TaskData(data.task, data.columns, meta))
         if path.name != task_file(data.task):
             raise ValueError(f"must be called {task_file(data.task)}")
     except (ValueError, TypeError) as error:
@@ -78,7 +78,7 @@ def parse_task(path: Path, content: bytes, source: Mapping[str, Any]) -> TaskDat
         if meta.get("content_sha256") != content_digest(columns, meta):
             raise ValueError("its values are not those it was written with: it is damaged")
         data = TaskData(meta.get("task", -1), columns, meta)
-        _check_task_data(data)
+        check_task_data(data)
     except ValueError as error:
         raise DatasetError(path, str(error), remake(path, known)) from error
     if task_of(path) not in (None, data.task):
@@ -87,7 +87,7 @@ def parse_task(path: Path, content: bytes, source: Mapping[str, Any]) -> TaskDat
     return data
 
 
-def _check_task_data(data: TaskData) -> None:
+def check_task_data(data: TaskData) -> None:
     """Raise a ValueError unless meta and columns keep every promise of the format."""
     tasks = check_meta(data.meta)
     if data.task != data.meta["task"]:

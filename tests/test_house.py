@@ -23,8 +23,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "meta_envs.__main__": {"meta_envs", *COMMAND_LINE},
     "meta_envs.commands": {"meta_envs", "numpy", "PIL", *COMMAND_LINE},
     "datagen": {
-        "datagen", "meta_envs", "gymnasium", "h5py", "matplotlib", "numpy", "PIL",
-        "stable_baselines3", "torch", *COMMAND_LINE,
+        "datagen", "meta_envs", "gymnasium", "h5py", "matplotlib", "minari", "numpy", "PIL",
+        "safetensors", "stable_baselines3", "torch", *COMMAND_LINE,
     },
     "ctmrl": {
         "ctmrl", "datagen.dataset", "meta_envs", "matplotlib", "numpy", "PIL", "safetensors",

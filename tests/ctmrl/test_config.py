@@ -48,6 +48,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("seed", -1, "from 0 to 9.22337e+18"),
     ("seed", 2**64, "from 0 to 9.22337e+18"),
     ("threads", 0, "at least 1"),
+    ("data_episodes", 0, "at least 1"),
     ("steps", 0, "at least 1"),
     ("meta_batch", 1, "at least 2"),
     ("batch_size", 0, "at least 1"),
@@ -93,3 +94,9 @@ def test_the_ends_of_a_range_are_in_it(name: str, value: int) -> None:
     config = smoke()
     protocol = dataclasses.replace(config.meta_test, **{name: value})
     check_settings(dataclasses.replace(config, meta_test=protocol))
+
+
+def test_an_option_that_is_not_given_is_in_its_range() -> None:
+    assert smoke().data_episodes is None
+    check_settings(smoke())
+    check_settings(dataclasses.replace(smoke(), data_episodes=1))

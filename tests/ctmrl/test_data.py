@@ -15,6 +15,7 @@ from ctmrl.data import OfflineData
 from ctmrl.errors import UsageError
 from datagen.dataset import DatasetError, open_dataset, task_file
 from tests.ctmrl.examples import ACT, OBS, generator, open_hand_made
+from tests.datagen.examples import graded_data, write_tasks
 
 LENGTHS = {7: (3, 11, 2, 5, 13), 2: (17,) * 7, 5: (1, 2, 3, 1, 2, 3)}
 """Episodes of three tasks, in the order of the table: the learner's tasks 0, 1 and 2."""
@@ -192,6 +193,52 @@ def test_the_test_tasks_files_are_never_read(wind_path: Path, tmp_path: Path) ->
     assert data.tasks.tolist() == [0, 1, 3, 4, 5, 6, 8]
     with pytest.raises(DatasetError):
         OfflineData(dataset, dataset.tasks)
+
+
+@pytest.fixture
+def graded_path(tmp_path: Path) -> Path:
+    """Three tasks with returns of 0.05, 0.5, 0.9 and 1.0 of the way to the best checkpoint."""
+    curve = {100: -29.0, 200: -20.0, 300: -12.0, 400: -10.0}
+    tasks = [graded_data(task, curve, episodes=4) for task in (0, 1, 3)]
+    return write_tasks(tmp_path / "graded", tasks)
+
+
+def test_a_slice_is_all_that_is_learned_from(graded_path: Path) -> None:
+    dataset = open_dataset(graded_path)
+    data = OfflineData(dataset.select("expert", 3), dataset.train_tasks)
+    whole = OfflineData(dataset, dataset.train_tasks)
+    # Checkpoints 300 and 400 are episodes 8 to 15, whose lengths go 25, 24, 23, 22, 21, 25, ...
+    kept, lengths = (8, 9, 10, 12, 13, 14), [25 - number % 5 for number in range(16)]
+    starts = np.cumsum([0, *lengths])
+    rows = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in kept])
+    assert data.episodes == 6
+    assert len(whole.table) == 3 * sum(lengths)
+    for i in range(3):
+        found, all_rows = (one.table[i * (len(one.table) // 3) :] for one in (data, whole))
+        assert found[: len(rows)].equal(all_rows[torch.from_numpy(rows)])
+    assert len(data.table) == 3 * len(rows)
+    # Each episode is one of its own: six contexts, six different episodes.
+    contexts = data.contexts(torch.arange(3), 6, 1, 400, generator())
+    for i in range(3):
+        drawn = [{tuple(row) for row in contexts[k, i].tolist()} for k in range(6)]
+        assert sorted(map(len, drawn)) == sorted(lengths[k] for k in kept)
+        assert len(set.union(*drawn)) == len(rows)
+
+
+def test_the_slice_that_is_all_is_the_same_as_none(graded_path: Path) -> None:
+    dataset = open_dataset(graded_path)
+    one, other = (
+        OfflineData(part, dataset.train_tasks) for part in (dataset, dataset.select("mixed"))
+    )
+    assert one.table.equal(other.table)
+
+
+def test_too_few_episodes_of_a_slice_are_one_sentence(graded_path: Path) -> None:
+    dataset = open_dataset(graded_path)
+    data = OfflineData(dataset.select("medium", 3), dataset.train_tasks)
+    said = "2 x 2 different episodes a task, the slice has 3: ask for more or lower --context"
+    with pytest.raises(UsageError, match=said):
+        data.check_episodes(2, 2)
 
 
 def test_a_damaged_training_file_is_an_error(wind_path: Path, tmp_path: Path) -> None:

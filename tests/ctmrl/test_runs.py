@@ -91,6 +91,24 @@ def test_other_settings_are_one_sentence_that_names_the_first(path: Path) -> Non
     assert contents(path) == before
 
 
+def test_settings_that_came_later_are_known_of_earlier_runs(path: Path) -> None:
+    with opened(path):
+        pass
+    # What a run had before there was a choice is no other setting, said or unsaid.
+    with opened(path, changed(quality="mixed", data_episodes=None)):
+        pass
+    for settings, said in (
+        (changed(quality="expert"), "settings.quality = mixed, this one has expert"),
+        (changed(data_episodes=3), "settings.data_episodes = None, this one has 3"),
+    ):
+        with pytest.raises(RunError, match=f" holds a run with {said}: choose another --out"):
+            RunFolder(path, settings, restart=False)
+    with opened(path, changed(quality="expert", data_episodes=3), restart=True):
+        pass
+    with pytest.raises(RunError, match=r"settings.data_episodes = 3, this one has None: "):
+        RunFolder(path, SETTINGS, restart=False)
+
+
 def test_a_refused_folder_is_not_kept_locked(path: Path) -> None:
     with opened(path):
         pass

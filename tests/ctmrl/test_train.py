@@ -24,7 +24,7 @@ from rich.console import Console
 
 from ctmrl.config import RunConfig
 from ctmrl.errors import UsageError
-from ctmrl.presets import preset
+from ctmrl.presets import config_from_settings, preset
 from ctmrl.runs import load_checkpoint, read_json
 from ctmrl.train import best_behavior, default_folder, split_tasks, train
 from datagen.dataset import open_dataset, task_file
@@ -198,6 +198,11 @@ def test_where_runs_go() -> None:
     assert default_folder(config) == Path("runs/point_robot/focal/seed-3")
     validating = dataclasses.replace(config, validate=True)
     assert default_folder(validating) == Path("runs/point_robot/focal-validation/seed-3")
+    expert = dataclasses.replace(config, quality="expert")
+    assert default_folder(expert) == Path("runs/point_robot/focal-expert/seed-3")
+    few = dataclasses.replace(validating, quality="early", data_episodes=10)
+    wanted = Path("runs/point_robot/focal-early-10-episodes-validation/seed-3")
+    assert default_folder(few) == wanted
 
 
 def test_the_split(wind_path: Path) -> None:
@@ -235,6 +240,42 @@ def test_validation_reads_and_uses_no_meta_test_task_and_no_held_out_one(
     assert stored["groups"] == {"unseen": [3], "seen": [0, 1, 4, 5, 6, 8]}
     with pytest.raises(ValueError, match="task_003"):
         run(short(), data=folder, out=tmp_path / "other")
+
+
+def test_a_run_on_a_slice_is_another_run(
+    finished_run: FinishedRun, wind_path: Path, tmp_path: Path
+) -> None:
+    before = contents(finished_run.path)
+    stored = read_json(finished_run.path / "config.json")
+    # As a run's file was before there were slices.
+    assert not {"quality", "data_episodes"} & stored["settings"].keys()
+    for changes, said in (
+        ({"quality": "early"}, "settings.quality = mixed, this one has early"),
+        ({"data_episodes": 2}, "settings.data_episodes = None, this one has 2"),
+    ):
+        with pytest.raises(UsageError, match=f" holds a run with {said}: choose another --out"):
+            run(smoke(40), data=wind_path, out=finished_run.path, **changes)
+    assert contents(finished_run.path) == before
+    record, _ = run(short(), data=wind_path, out=tmp_path / "run", quality="early")
+    found = read_json(tmp_path / "run" / "config.json")
+    assert found["settings"]["quality"] == "early"
+    # A report pools runs of one method, and so must not take this for the whole data's.
+    assert record["method"] == "ctmrl-early"
+    assert "data_episodes" not in found["settings"]
+    assert found["dataset"] == stored["dataset"]
+    restored = config_from_settings(found, tmp_path / "run" / "config.json")
+    assert (restored.quality, restored.data_episodes) == ("early", None)
+    # The same again is the same run; all data are not.
+    again, shown = run(short(), data=wind_path, out=tmp_path / "run", quality="early")
+    assert again == record
+    assert "is finished" in shown
+    with pytest.raises(UsageError, match=r"settings\.quality = early, this one has mixed"):
+        run(short(), data=wind_path, out=tmp_path / "run")
+    mixed, _ = run(short(), data=wind_path, out=tmp_path / "mixed")
+    assert mixed["groups"]["seen"]["references"] == record["groups"]["seen"]["references"]
+    one, other = (load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("run", "mixed"))
+    key = "actor_critic/actor.net.0.weight"
+    assert not one[key].equal(other[key])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -95,6 +95,18 @@ def test_wrong_data_is_one_sentence(
         f"{sparse_path} is of sparse_point_robot, not of point_robot_wind: "
         "give --env sparse_point_robot or another --data"
     )
+    said = mistake("--quality", "medium")
+    assert said.startswith(f"{wind_path / task_file(0)}: has no medium checkpoint: none is 0.2 to ")
+    assert said.endswith(
+        f"; `python -m datagen.inspect {wind_path}` shows what the slices hold, choose another"
+    )
+    assert mistake("--data-episodes", "4").startswith(
+        f"{wind_path / task_file(0)}: has 3 episodes of checkpoint 200, not the 4 asked for; "
+    )
+    assert mistake("--quality", "early", "--data-episodes", "1") == (
+        "contexts need 2 x 1 different episodes a task, the slice has 1: "
+        "ask for more or lower --context-episodes"
+    )
     damaged = shutil.copytree(wind_path, tmp_path / "damaged")
     (damaged / task_file(4)).write_bytes(b"x")
     assert "task_004.h5" in mistake(data=damaged)
@@ -118,7 +130,13 @@ def test_a_folder_of_something_else_is_left_alone(mistake: Any, tmp_path: Path) 
 
 @pytest.mark.parametrize(
     "words",
-    [("--no-such-option", "3"), ("--steps", "many"), ("--codes",), ("stray",)],
+    [
+        ("--no-such-option", "3"),
+        ("--steps", "many"),
+        ("--codes",),
+        ("stray",),
+        ("--quality", "good"),
+    ],
     ids=str,
 )
 def test_what_is_no_option_is_told_and_exits_with_2(
@@ -162,6 +180,8 @@ def test_help_shows_the_options_of_the_method(capsys: pytest.CaptureFixture[str]
          preset("sparse_point_robot", "focal", "paper")),
         (["--preset", "smoke", "--seed", "7"],
          preset("point_robot_wind", "ctmrl", "smoke", seed=7)),
+        (["--quality", "expert", "--data-episodes", "10"],
+         preset("point_robot_wind", "ctmrl", "standard", quality="expert", data_episodes=10)),
         (["--seed", "7", "--data", "d", "--out", "o", "--restart", "--validate"],
          preset("point_robot_wind", "ctmrl", "standard", seed=7, data=Path("d"), out=Path("o"),
                 restart=True, validate=True)),

@@ -124,6 +124,51 @@ def index_of(
     }
 
 
+def graded_data(
+    task: int, returns: dict[int, float], episodes: int = 3, random: float = -30.0
+) -> TaskData:
+    """A task with these returns at its checkpoints, and episodes of 21 to 25 steps for each.
+
+    Args:
+        task: row of the robot in the wind's task set.
+        returns: of the stochastic policy by checkpoint, rising.
+        episodes: of each checkpoint.
+        random: return of the random policy.
+    """
+    data = task_data(task, episodes=2 * -(-episodes * len(returns) // 2))
+    lengths = [25 - number % 5 for number in range(episodes * len(returns))]
+    rows = np.concatenate([25 * k + np.arange(length) for k, length in enumerate(lengths)])
+    columns = {name: column[rows] for name, column in data.columns.items()}
+    last = np.cumsum(lengths) - 1
+    columns["terminals"][last] = ~columns["timeouts"][last]
+    marks = np.repeat(np.array(list(returns), dtype=np.int32), episodes)
+    columns["checkpoint"] = np.repeat(marks, lengths)
+    by_checkpoint = {str(mark): value for mark, value in returns.items()}
+    stated = {
+        "random": random,
+        "expert": -5.0,
+        "behavior": by_checkpoint,
+        "deterministic": dict(by_checkpoint),
+    }
+    return TaskData(task, columns, {**data.meta, "returns": stated})
+
+
+def write_tasks(folder: Path, tasks: Sequence[TaskData]) -> Path:
+    """Write a dataset of any tasks of the robot in the wind; returns the folder, which is made."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for data in tasks:
+        write_task(folder / task_file(data.task), data)
+    index = index_of(folder, "point_robot_wind", [data.task for data in tasks], 4, 0)
+    by_task = {data.task: data for data in tasks}
+    for record in index["tasks"]:
+        data = by_task[record["task"]]
+        record["returns"] = data.meta["returns"]
+        record["transitions"] = len(data)
+        record["episodes"] = int(data.episode[-1]) + 1
+    write_index(folder, index)
+    return folder
+
+
 def independent_digest(columns: dict[str, NDArray[Any]], meta: dict[str, Any]) -> str:
     """`content_sha256` after docs/dataset_format.md, without the code under test."""
     total = hashlib.sha256()

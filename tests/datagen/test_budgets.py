@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from datagen.budgets import BUDGETS, budget
+from datagen.budgets import BUDGETS, FleetSettings, budget, other_options
 from meta_envs import resolve
-from tests.meta_envs.robots import POINT_ROBOTS
+from tests.meta_envs.robots import MUJOCO_ROBOTS, POINT_ROBOTS
 
 
 @pytest.mark.parametrize("env", ["point_robot", "PointRobotWind-v0", "sparse-point-robot"])
@@ -24,13 +24,14 @@ def test_point_robots_follow_the_protocol(env: str, name: str) -> None:
     assert found.total_episodes == 700
 
 
-@pytest.mark.parametrize("env", POINT_ROBOTS)
+@pytest.mark.parametrize("env", [*POINT_ROBOTS, *MUJOCO_ROBOTS])
 def test_every_environment_has_the_three_budgets(env: str) -> None:
     assert list(BUDGETS[env]) == ["paper", "standard", "smoke"]
     for name, row in BUDGETS[env].items():
         assert row.name == name
         # Checkpoints fall between two bursts of updates, so that each policy has had updates.
         assert row.checkpoints[0] - row.random_steps >= 2 * row.sac.update_every
+        assert (row.fleet is not None) == (env in MUJOCO_ROBOTS)
 
 
 def test_config_is_json_and_has_every_number() -> None:
@@ -43,6 +44,48 @@ def test_config_is_json_and_has_every_number() -> None:
         "hidden", "learning_rate", "batch_size", "gamma", "tau", "update_every",
         "initial_temperature",
     }  # fmt: skip
+
+
+def test_config_names_the_fleet_only_where_there_is_one() -> None:
+    assert "fleet" not in budget("point_robot", "paper").config()
+    config = budget("hopper_params", "smoke").config()
+    assert config["fleet"] == {"size": 25, "precision": "auto"}
+    assert json.loads(json.dumps(config)) == config
+    with pytest.raises(ValueError, match="a fleet has at least 1 task, got 0"):
+        FleetSettings(0, "float32")
+
+
+@pytest.mark.parametrize(
+    ("env", "fleet", "options"),
+    [
+        ("point_robot", None, []),
+        ("point_robot", FleetSettings(50, "float32"), ["--engine", "fleet"]),
+        (
+            "point_robot",
+            FleetSettings(4, "float32"),
+            ["--engine", "fleet", "--fleet-size", "4"],
+        ),
+        ("ant-goal", None, ["--engine", "sb3"]),
+        ("ant-goal", FleetSettings(25, "bfloat16"), []),
+        ("ant-goal", FleetSettings(4, "float32"), ["--fleet-size", "4"]),
+    ],
+)
+def test_options_that_a_budget_alone_does_not_say(
+    env: str, fleet: FleetSettings | None, options: list[str]
+) -> None:
+    # The precision is always said: by default it is the machine's.
+    precision = ["--precision", fleet.precision] if fleet else []
+    config = replace(budget(env, "smoke"), fleet=fleet).config()
+    assert other_options(env, "smoke", config) == [*options, *precision]
+    config["episodes"] = 13
+    assert other_options(env, "smoke", config) == ["--episodes", "13", *options, *precision]
+
+
+def test_options_of_a_config_that_is_none() -> None:
+    with pytest.raises(KeyError):
+        other_options("ant_goal", "smoke", {})
+    with pytest.raises(ValueError, match="has no budget 'huge'"):
+        other_options("ant_goal", "huge", {"episodes": 3})
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 
-from datagen.budgets import budget
+from datagen.budgets import FleetSettings, budget
 from datagen.card import card, mean_returns, named_checkpoints, remake_command, rows_text
+from datagen.collect import CollectConfig, plan_of
 from datagen.job import origin
 from tests.datagen.examples import index_of, write_dataset
 
@@ -80,6 +84,45 @@ def test_the_command_has_what_differs_from_the_defaults(index: dict[str, Any]) -
     assert remake_command(thin) == f"{start} --episodes 12 --seed 0"
 
 
+def fleet_index(env: str, fleet: FleetSettings | None) -> dict[str, Any]:
+    """The head of an index, and two tasks by their numbers."""
+    made = origin(env, replace(budget(env, "smoke"), fleet=fleet), 0)
+    return {**made, "tasks": [{"task": 4}, {"task": 5}]}
+
+
+@pytest.mark.parametrize(
+    ("env", "fleet", "options"),
+    [
+        ("point_robot_wind", None, ""),
+        ("point_robot_wind", FleetSettings(50, "float32"), "--engine fleet --precision float32 "),
+        (
+            "point_robot_wind",
+            FleetSettings(7, "bfloat16"),
+            "--engine fleet --fleet-size 7 --precision bfloat16 ",
+        ),
+        ("hopper_params", FleetSettings(25, "bfloat16"), "--precision bfloat16 "),
+        ("hopper_params", FleetSettings(3, "float32"), "--fleet-size 3 --precision float32 "),
+        ("hopper_params", None, "--engine sb3 "),
+    ],
+)
+def test_the_command_says_how_the_policies_were_trained(
+    env: str, fleet: FleetSettings | None, options: str
+) -> None:
+    command = remake_command(fleet_index(env, fleet))
+    start = f"python -m datagen.collect --env {env} --budget smoke "
+    assert command == f"{start}{options}--tasks 4-5 --seed 0"
+    # And the command is understood, and means the same.
+    config = tyro.cli(CollectConfig, args=shlex.split(command)[3:])
+    assert plan_of(config).budget == replace(budget(env, "smoke"), fleet=fleet)
+
+
+def test_a_fleets_settings_are_in_the_card(index: dict[str, Any]) -> None:
+    config = {**index["config"], "fleet": {"size": 1500, "precision": "float32"}}
+    text = card({**index, "config": config})
+    assert "| `fleet` | precision float32, size 1,500 |\n" in text
+    assert card(json.loads(json.dumps({**index, "config": config}, sort_keys=True))) == text
+
+
 def record(behavior: dict[str, float], **more: float) -> dict[str, Any]:
     deterministic = {mark: value + 1 for mark, value in behavior.items()}
     returns = {"random": -30.0, "expert": -5.0, **more}
@@ -106,3 +149,13 @@ def test_checkpoints_are_ordered_as_numbers() -> None:
 def test_nothing_of_this_machine_is_in_it(index: dict[str, Any], tmp_path: Path) -> None:
     assert str(tmp_path.parent) not in card(index)
     assert not re.search(r"\b20\d\d-\d\d-\d\d\b|\d\d:\d\d", card(index))
+
+
+@pytest.mark.parametrize(
+    ("rows", "category"),
+    [(999, "n<1K"), (1_000, "1K<n<10K"), (10**6, "1M<n<10M"), (18_000_000, "10M<n<100M")],
+)
+def test_the_size_is_one_of_hugging_faces(rows: int, category: str, index: dict[str, Any]) -> None:
+    records = [{**record, "transitions": 0} for record in index["tasks"]]
+    records[0]["transitions"] = rows
+    assert f"size_categories:\n- {category}\n" in card({**index, "tasks": records})

@@ -20,8 +20,9 @@ import pytest
 from datagen import check, collect, estimate
 from datagen.budgets import budget
 from datagen.collect import main
+from datagen.collect_task import collect_task
 from datagen.dataset import open_dataset
-from datagen.job import Job, collect_task, origin
+from datagen.job import Job, origin
 
 Capture = pytest.CaptureFixture[str]
 TASKS = range(8)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from datagen import dataset as public
-from datagen.dataset import Dataset, DatasetError, open_dataset, write_index, write_task
+from datagen.dataset import Dataset, DatasetError, Slice, open_dataset, write_index, write_task
 from datagen.files import digest
 from meta_envs import task_set
 from tests.datagen.examples import index_of, task_data, write_dataset
@@ -335,10 +335,14 @@ def test_the_documented_snippets_work(
     Path("datasets").mkdir()
     shutil.copytree(folder, "datasets/point_robot_wind")
     snippets = re.findall(r"```python\n(.*?)```", DOCS.read_text(), flags=re.DOTALL)
-    assert len(snippets) == 2
+    assert len(snippets) == 3
+    names: dict[str, Any] = {}
     for snippet in snippets:
-        exec(snippet, {})
+        exec(snippet, names)
     assert capsys.readouterr().out == "point_robot_wind 3 (100,)\n"
+    assert names["expert"].part == Slice("expert", 2)
+    assert names["data"].task == 3
+    assert names["rows"] == 4 * 50
     with h5py.File("datasets/point_robot_wind/task_003.h5", "r+") as file:
         file["rewards"][7] += 1.0
     with pytest.raises(AssertionError):

@@ -11,13 +11,14 @@ import resource
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from datagen.budgets import budget
+from datagen.budgets import FleetSettings, budget
 from datagen.files import (
     DatasetError,
     canonical_json,
@@ -164,6 +165,25 @@ def test_the_remedy_is_a_command_that_shells_understand() -> None:
     assert "--env sparse_point_robot " in collect_command(folder, {"env": "sparse_point_robot"})
     assert "--env point_robot_wind " in collect_command(folder, {"env": "; rm", "seed": [1]})
     assert "--env ENVIRONMENT " in collect_command(Path("x"), {"env": None})
+
+
+def test_the_remedy_says_how_the_policies_were_trained() -> None:
+    def options(env: str, fleet: FleetSettings | None, more: dict[str, Any]) -> str:
+        rows = replace(budget(env, "smoke"), fleet=fleet)
+        source = {"env": env, "budget": "smoke", "seed": 3, "config": {**rows.config(), **more}}
+        command = collect_command(Path("data"), source)
+        return command.removesuffix(" --out data").rpartition("--seed 3")[2]
+
+    robot, hopper = "point_robot_wind", "hopper_params"
+    both = " --engine fleet --precision float32"
+    assert options(robot, None, {}) == ""
+    assert options(hopper, None, {}) == " --engine sb3"
+    assert options(robot, FleetSettings(50, "float32"), {}) == both
+    assert options(hopper, FleetSettings(25, "bfloat16"), {}) == " --precision bfloat16"
+    thin = options(hopper, FleetSettings(9, "float32"), {"episodes": 1})
+    assert thin == " --episodes 1 --fleet-size 9 --precision float32"
+    assert options(hopper, None, {"fleet": "nonsense"}) == ""
+    assert options(hopper, None, {"fleet": {"size": 3}}) == ""
 
 
 def test_what_is_no_readable_file_is_a_dataset_error(tmp_path: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from datagen.budgets import budget
+from datagen.budgets import FleetSettings, budget
 from datagen.dataset import write_task
 from datagen.plan import Plan, parse_shard, parse_tasks
 from meta_envs import task_set
@@ -56,6 +57,31 @@ def test_a_text_that_is_no_shard(text: str) -> None:
 def test_an_empty_shard() -> None:
     with pytest.raises(ValueError, match="--shard 3/4 of 3 tasks is empty"):
         parse_shard("3/4", (1, 2, 3))
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "sizes"),
+    [
+        (40, 25, [20, 20]),
+        (41, 20, [13, 14, 14]),
+        (10, 10, [10]),
+        (11, 10, [5, 6]),
+        (3, 25, [3]),
+        (5, 1, [1] * 5),
+        (1, 9, [1]),
+    ],
+)
+def test_groups_are_of_about_one_size(count: int, size: int, sizes: list[int]) -> None:
+    tasks = tuple(range(2, 2 * count + 2, 2))
+    rows = replace(budget("hopper_params", "smoke"), fleet=FleetSettings(size, "float32"))
+    groups = Plan("hopper_params", tasks, rows, 0, Path(), 1).groups
+    assert [len(group) for group in groups] == sizes
+    assert tuple(task for group in groups for task in group) == tasks
+
+
+def test_without_a_fleet_each_task_is_alone() -> None:
+    plan = Plan("point_robot", (1, 4, 6), budget("point_robot", "smoke"), 0, Path(), 1)
+    assert plan.groups == ((1,), (4,), (6,))
 
 
 @pytest.mark.parametrize("env", ["point_robot_wind", "sparse_point_robot"])

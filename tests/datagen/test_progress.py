@@ -53,9 +53,9 @@ def test_duration(seconds: float, text: str) -> None:
 def collect_two_of_three(console: Console) -> None:
     with CollectionDisplay(console, 3, 2, PAPER) as display:
         for task in (3, 8):
-            display.started(task)
+            display.started((task,))
             for step in (1000, 3000, 4800):
-                display.step(task, step)
+                display.step((task,), step)
             display.done(task, RETURNS)
 
 
@@ -68,14 +68,47 @@ def test_a_line_a_task_off_the_terminal() -> None:
     assert re.fullmatch(rf"task 8 \(3/3\): {numbers}", last)
 
 
+def test_a_group_of_tasks_is_trained_first() -> None:
+    out, rows = io.StringIO(), budget("hopper_params", "smoke")
+    console = Console(file=out, force_terminal=True, width=100, color_system=None)
+    returns = {**RETURNS, "behavior": {"400": 31.5}}
+    with CollectionDisplay(console, 3, 3, rows) as display:
+        display.started((3, 4, 8))
+        display.step((3, 4, 8), 300)
+        assert display._progress is not None
+        display._progress.refresh()
+        training = out.getvalue()
+        display.step((3, 4, 8), 400)
+        display.trained((3, 4, 8))
+        for task in (3, 4, 8):
+            display.started((task,))
+            display.done(task, returns)
+    assert re.search(r"tasks 3 to 8 +\S+ +300/400 +learning", training)
+    for count, task in enumerate((3, 4, 8), start=1):
+        assert f"task {task} ({count}/3): behaviour 31.50" in out.getvalue()
+
+
+def test_a_fleets_training_is_not_all_of_its_time() -> None:
+    clock, rows = Clock(), budget("hopper_params", "smoke")
+    left = TimeLeft(2, rows, clock)
+    clock.now += 10.0
+    for task in (0, 1):
+        left.step(task, 300)
+    # Half of the updates, which are four fifths of everything.
+    assert left.seconds() == pytest.approx(15.0)
+    for task in (0, 1):
+        left.step(task, 400)
+    assert left.seconds() == pytest.approx(2.5)
+
+
 def test_bars_on_a_terminal() -> None:
     out = io.StringIO()
     console = Console(file=out, force_terminal=True, width=100, color_system=None)
     with CollectionDisplay(console, 3, 2, PAPER) as display:
-        display.started(3)
-        display.step(3, 1000)
-        display.started(8)
-        display.step(8, 4800)
+        display.started((3,))
+        display.step((3,), 1000)
+        display.started((8,))
+        display.step((8,), 4800)
         assert display._progress is not None
         display._progress.refresh()
         shown = out.getvalue()

@@ -1,0 +1,86 @@
+"""A fleet's policies as files that `stable_baselines3.SAC.load` opens."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from stable_baselines3 import SAC
+from torch import Tensor
+
+from datagen.behavior import training_environment
+from datagen.budgets import Budget
+from datagen.files import sync_folder
+
+
+def sac_of(env: str, task: int, budget: Budget, tensors: dict[str, Tensor]) -> SAC:
+    """Stable-Baselines3's SAC with one task's networks.
+
+    Args:
+        env: any of the environment's names.
+        task: row of its task set.
+        budget: how the fleet learned.
+        tensors: the task's part of `FleetPolicy.state_dict()`, without the leading axis, and its
+            `log_temperature`.
+    """
+    settings = budget.sac
+    model = SAC(
+        "MlpPolicy",
+        training_environment(env, task),
+        learning_rate=settings.learning_rate,
+        buffer_size=budget.steps,
+        learning_starts=budget.random_steps,
+        batch_size=settings.batch_size,
+        tau=settings.tau,
+        gamma=settings.gamma,
+        train_freq=settings.update_every,
+        gradient_steps=settings.update_every,
+        ent_coef=f"auto_{settings.initial_temperature}",
+        policy_kwargs={"net_arch": list(settings.hidden)},
+        device="cpu",
+    )
+    model.policy.load_state_dict(_state(tensors, len(settings.hidden)))
+    assert model.log_ent_coef is not None
+    with torch.no_grad():
+        model.log_ent_coef.copy_(tensors["log_temperature"].reshape(1))
+    return model
+
+
+def _state(tensors: dict[str, Tensor], hidden: int) -> dict[str, Tensor]:
+    """Stable-Baselines3's names and shapes."""
+    state = {}
+    acts = tensors[f"actor.biases.{hidden}"].shape[-1] // 2
+    halves = {"mu": slice(0, acts), "log_std": slice(acts, 2 * acts)}
+    for name, part in halves.items():
+        state[f"actor.{name}.weight"] = tensors[f"actor.weights.{hidden}"][:, part].T
+        state[f"actor.{name}.bias"] = tensors[f"actor.biases.{hidden}"][0, part]
+    sources = {"actor": "actor.latent_pi"}
+    for number in range(2):
+        sources[f"critic_{number}"] = f"critic.qf{number}"
+        sources[f"target_{number}"] = f"critic_target.qf{number}"
+    for ours, theirs in sources.items():
+        for layer in range(hidden if ours == "actor" else hidden + 1):
+            # Between the linear layers are the ReLUs.
+            state[f"{theirs}.{2 * layer}.weight"] = tensors[f"{ours}.weights.{layer}"].T
+            state[f"{theirs}.{2 * layer}.bias"] = tensors[f"{ours}.biases.{layer}"][0]
+    return state
+
+
+def export_policy(path: Path, model: SAC) -> None:
+    """Write Stable-Baselines3's file, whole or not at all.
+
+    Raises:
+        OSError: the disk is full or the folder is not there.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as file:
+            model.save(file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)

@@ -1,0 +1,148 @@
+"""Multi-layer perceptrons of many tasks at once, as batched weights [task, in, out]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from datagen.budgets import Precision
+
+
+def best_precision(device: torch.device | str = "cpu") -> Precision:
+    """bfloat16 where the hardware multiplies matrices of it, float32 elsewhere."""
+    if torch.device(device).type == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
+    # Older versions of torch cannot tell.
+    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    able = capabilities.get("amx_bf16") or capabilities.get("avx512_bf16")
+    return "bfloat16" if able else "float32"
+
+
+def check_precision(precision: str, device: str) -> Precision:
+    """A precision as it is, or for "auto" the best one of a device.
+
+    Raises:
+        ValueError: torch cannot use the device.
+    """
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"--device {device} cannot be used here: {reason}") from None
+    if precision == "auto":
+        return best_precision(device)
+    return "bfloat16" if precision == "bfloat16" else "float32"
+
+
+class BatchedMLP(nn.Module):
+    """One perceptron a task, ReLU between its layers; the tasks share nothing.
+
+    A backward pass writes the gradients of the parameters over those of the last one, into memory
+    of their own: they need no zeroing, and they do not add up.
+    """
+
+    def __init__(
+        self,
+        sizes: Sequence[int],
+        generators: Sequence[np.random.Generator],
+        precision: Precision = "float32",
+    ) -> None:
+        """Draw the weights as `torch.nn.Linear` does, each task from a generator of its own.
+
+        Args:
+            sizes: of the input, each hidden layer and the output.
+            generators: one a task.
+            precision: of the matrix products.
+        """
+        super().__init__()
+        self.dtype = getattr(torch, precision)
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for size, out in pairwise(sizes):
+            for shape, target in (((size, out), self.weights), ((1, out), self.biases)):
+                drawn = np.stack([_uniform(one, shape, size**-0.5) for one in generators])
+                target.append(nn.Parameter(torch.from_numpy(drawn)))
+        for parameter in self.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        self._lower: list[tuple[Tensor, Tensor]] = []
+        self.refresh()
+
+    def forward(self, inputs: Tensor, learn: bool = True) -> Tensor:
+        """Outputs [task, batch, out] of inputs [task, batch, in], both float32.
+
+        Args:
+            inputs: the gradient reaches them either way.
+            learn: whether it reaches the parameters.
+        """
+        parameters = tuple(self.parameters()) if learn else ()
+        outputs: Tensor = _Pass.apply(inputs, self, *parameters)  # type: ignore[no-untyped-call] # torch's own
+        return outputs
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        # Moved to another device, the network computes with weights that are there.
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call] # torch's own
+        self._lower = []
+        self.refresh()
+        return self
+
+    @property
+    def lower(self) -> list[tuple[Tensor, Tensor]]:
+        """Weight and bias of each layer in the precision of the matrix products."""
+        return self._lower
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Take over what an optimiser has done to the parameters; call it after each step."""
+        pairs = zip(self.weights, self.biases, strict=True)
+        if self.dtype == torch.float32 or not self._lower:
+            self._lower = [(w.detach().to(self.dtype), b.detach().to(self.dtype)) for w, b in pairs]
+            return
+        for (weight, bias), (w, b) in zip(self._lower, pairs, strict=True):
+            weight.copy_(w)
+            bias.copy_(b)
+
+
+class _Pass(torch.autograd.Function):
+    """All layers forwards and backwards, without a copy of anything that is not needed."""
+
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, net: BatchedMLP, *parameters: Tensor) -> Tensor:
+        last = len(net.lower) - 1
+        values = [inputs.to(net.dtype)]
+        for layer, (weight, bias) in enumerate(net.lower):
+            value = torch.baddbmm(bias, values[-1], weight)
+            values.append(value if layer == last else value.relu_())
+        # Without the output: it knows its way back to here, and the circle would keep both.
+        ctx.net, ctx.values, ctx.parameters = net, values[:-1], len(parameters)
+        return values[-1].float()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        net, values = ctx.net, ctx.values
+        nothing = (None,) * ctx.parameters
+        gradient = gradients[0].to(net.dtype)
+        for layer in reversed(range(len(net.lower))):
+            if ctx.parameters:
+                below = values[layer].transpose(1, 2)
+                net.weights[layer].grad.copy_(torch.bmm(below, gradient))
+                net.biases[layer].grad.copy_(gradient.sum(1, keepdim=True))
+            if layer == 0 and not ctx.needs_input_grad[0]:
+                return (None, None, *nothing)
+            across = net.lower[layer][0].transpose(1, 2)
+            # Of a single output this is an outer product, which bmm takes four times as long for.
+            outer = across.shape[1] == 1
+            gradient = gradient * across if outer else torch.bmm(gradient, across)
+            if layer > 0:
+                gradient = torch.ops.aten.threshold_backward(gradient, values[layer], 0)
+        return (gradient.float(), None, *nothing)
+
+
+def _uniform(
+    generator: np.random.Generator, shape: tuple[int, int], bound: float
+) -> np.ndarray[Any, np.dtype[np.float32]]:
+    drawn = generator.random(shape, dtype=np.float32)
+    return (2 * drawn - 1) * np.float32(bound)
