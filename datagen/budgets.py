@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
@@ -32,6 +32,13 @@ class SACSettings:
     tau: float
     update_every: int
     initial_temperature: float
+
+
+def groups_of(tasks: Sequence[int], size: int) -> tuple[tuple[int, ...], ...]:
+    """Tasks in as few groups of at most `size` as there can be, as even as they can be."""
+    count = -(-len(tasks) // size)
+    bounds = [len(tasks) * part // count for part in range(count + 1)]
+    return tuple(tuple(tasks[a:b]) for a, b in pairwise(bounds))
 
 
 Precision = Literal["float32", "bfloat16"]

@@ -30,10 +30,21 @@ _COLLECTION_SETTINGS = (
     "The behaviour policies are Stable-Baselines3's SAC. `datagen/budgets.py` says what each",
     "setting is; what is not listed has Stable-Baselines3's default.",
 )
+_FLEET_SETTINGS = (
+    "The behaviour policies are Stable-Baselines3's SAC, those of a group of tasks trained side by",
+    "side. `datagen/budgets.py` says what each setting is; what is not listed has",
+    "Stable-Baselines3's default.",
+)
 _IMPORT_SETTINGS = (
     "What the import found. The seed of the collection is unknown, which -1 stands for; the",
     "versions are those of the import.",
 )
+
+
+def _settings_text(index: Mapping[str, Any]) -> tuple[str, ...]:
+    if _is_legacy(index):
+        return _IMPORT_SETTINGS
+    return _FLEET_SETTINGS if "fleet" in index["config"] else _COLLECTION_SETTINGS
 
 
 def rows_text(tasks: Sequence[int]) -> str:
@@ -285,7 +296,7 @@ def _settings_tables(index: Mapping[str, Any]) -> list[str]:
     return [
         "## Settings",
         "",
-        *(_IMPORT_SETTINGS if _is_legacy(index) else _COLLECTION_SETTINGS),
+        *_settings_text(index),
         "",
         *_table(["setting", "value"], shown),
         "",

@@ -5,7 +5,6 @@ python -m datagen.collect --env point_robot_wind --budget paper --workers 2
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shlex
 import sys
@@ -76,8 +75,8 @@ class CollectConfig:
     device: str = "cpu"
     """Where a fleet learns, such as cpu or cuda."""
     policies: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Also write the last policy of every task a fleet has trained to this folder, as a file that
-    stable_baselines3.SAC.load opens."""
+    """Also write the last policy of every task that a fleet collects now to this folder, as a file
+    that stable_baselines3.SAC.load opens."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Episodes of each checkpoint, instead of the budget's, for a smaller dataset."""
     dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -247,13 +246,16 @@ def _train(
         for group in plan.groups
         if group in groups
     ]
+    missing = {job.task for job in wanted}
     for fleet, event in _events(train_fleet, fleets, plan.workers):
+        # Some of a group may be finished, where a file of it was lost.
+        tasks = tuple(task for task in fleet.tasks if task in missing)
         if event.kind == "started":
-            display.started(fleet.tasks)
+            display.started(tasks)
         elif event.kind == "done":
-            display.trained(fleet.tasks)
+            display.trained(tasks)
         elif isinstance(event.value, int):
-            display.step(fleet.tasks, event.value)
+            display.step(tasks, event.value)
 
 
 def _run(jobs: Sequence[Job], workers: int, display: CollectionDisplay) -> None:
@@ -309,8 +311,7 @@ def describe(plan: Plan, console: Console) -> None:
     for name, text in lines.items():
         _say(console, f"{name + ':':13}{text}")
     if missing:
-        left = dataclasses.replace(plan, tasks=missing)
-        time = duration(seconds_of(left))
+        time = duration(seconds_of(plan, missing))
         _say(console, f"{'time:':13}about {time} with {_count(plan.workers, 'worker')}")
 
 

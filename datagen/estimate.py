@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -88,13 +89,14 @@ def seconds_a_rollout(env: str, episodes: int) -> float:
     return time.perf_counter() - begin
 
 
-def seconds_of(plan: Plan) -> float:
-    """About how long the tasks of a plan take, all of them, its workers side by side."""
+def seconds_of(plan: Plan, missing: Sequence[int]) -> float:
+    """About how long the tasks of a plan that are missing take, its workers side by side."""
     budget = plan.budget
     if budget.fleet:
-        update, jobs = seconds_a_fleet_step(plan), len(plan.groups)
+        update = seconds_a_fleet_step(plan)
+        jobs = sum(not set(missing).isdisjoint(group) for group in plan.groups)
     else:
-        update, jobs = seconds_a_learning_step(plan.env, budget), len(plan.tasks)
+        update, jobs = seconds_a_learning_step(plan.env, budget), len(missing)
     learning = budget.updates * update * -(-jobs // plan.workers)
     rollouts = len(budget.checkpoints) * seconds_a_rollout(plan.env, budget.episodes)
-    return START_SECONDS + learning + rollouts * -(-len(plan.tasks) // plan.workers)
+    return START_SECONDS + learning + rollouts * -(-len(missing) // plan.workers)

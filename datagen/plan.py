@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
-from datagen.budgets import Budget
+from datagen.budgets import Budget, groups_of
 from datagen.columns import COLUMNS
 from meta_envs import TaskSet, resolve
 from meta_envs.registry import definition
@@ -44,10 +43,7 @@ class Plan:
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """The tasks in groups that are trained side by side; each alone without a fleet."""
-        size = self.budget.fleet.size if self.budget.fleet else 1
-        count = -(-len(self.tasks) // size)
-        bounds = [len(self.tasks) * part // count for part in range(count + 1)]
-        return tuple(self.tasks[a:b] for a, b in pairwise(bounds))
+        return groups_of(self.tasks, self.budget.fleet.size if self.budget.fleet else 1)
 
     @property
     def rows(self) -> int:

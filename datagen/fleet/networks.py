@@ -30,6 +30,8 @@ def check_precision(precision: str, device: str) -> Precision:
         ValueError: torch cannot use the device.
     """
     try:
+        if torch.device(device).type not in ("cpu", "cuda"):
+            raise RuntimeError("fleets learn on cpu and cuda")
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]

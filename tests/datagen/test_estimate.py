@@ -39,9 +39,10 @@ def test_the_estimate_is_in_proportion(monkeypatch: pytest.MonkeyPatch, tmp_path
     paper = budget("point_robot", "paper")
     plan = Plan("point_robot", tuple(range(5)), paper, 0, tmp_path, workers=2)
     task = 2800 * 0.01 + 14 * 0.5
-    assert seconds_of(plan) == pytest.approx(START_SECONDS + 3 * task)
+    assert seconds_of(plan, plan.tasks) == pytest.approx(START_SECONDS + 3 * task)
+    assert seconds_of(plan, (1, 4)) == pytest.approx(START_SECONDS + task)
     alone = dataclasses.replace(plan, workers=1)
-    assert seconds_of(alone) == pytest.approx(START_SECONDS + 5 * task)
+    assert seconds_of(alone, plan.tasks) == pytest.approx(START_SECONDS + 5 * task)
 
 
 def test_a_step_of_a_fleet_is_measured_on_one_thread(
@@ -71,4 +72,7 @@ def test_a_fleets_estimate_is_in_proportion(
     rows = budget("hopper_params", "smoke")
     plan = Plan("hopper_params", tuple(range(60)), rows, 0, tmp_path, workers=2)
     # Three groups of 20 on two workers are two rounds; then 30 tasks a worker are rolled out.
-    assert seconds_of(plan) == pytest.approx(START_SECONDS + 2 * 200 * 0.01 + 30 * 2 * 0.5)
+    every = seconds_of(plan, plan.tasks)
+    assert every == pytest.approx(START_SECONDS + 2 * 200 * 0.01 + 30 * 2 * 0.5)
+    # Two tasks of one group: that is trained as a whole, and the two are rolled out.
+    assert seconds_of(plan, (3, 5)) == pytest.approx(START_SECONDS + 200 * 0.01 + 2 * 0.5)

@@ -208,3 +208,22 @@ def test_errors_survive_the_way_from_a_worker_process() -> None:
     copy = pickle.loads(pickle.dumps(error))
     assert str(copy) == str(error) == "a/task_001.h5: is empty; delete it"
     assert (copy.path, copy.fault, copy.remedy) == (error.path, error.fault, error.remedy)
+
+
+def test_a_task_of_a_fleet_is_collected_again_in_its_group() -> None:
+    config = {"episodes": 2, "fleet": {"size": 3, "precision": "float32"}}
+    index = {
+        "env": "hopper_params",
+        "budget": "smoke",
+        "seed": 0,
+        "config": config,
+        "tasks": [{"task": task} for task in (1, 2, 5, 7, 9)],
+    }
+    words = collect_command(Path("data"), index, 5).split()
+    # Five tasks in groups of three at most are two and three.
+    assert words[words.index("--tasks") + 1] == "5,7,9"
+    assert words[words.index("--fleet-size") + 1] == "3"
+    alone = {key: value for key, value in index.items() if key != "tasks"}
+    for source, task in ((alone, 5), (index, 4)):
+        words = collect_command(Path("data"), source, task).split()
+        assert words[words.index("--tasks") + 1] == str(task)
