@@ -237,8 +237,13 @@ def _prepare(folder: Path, option: str = "--out") -> None:
 def _train(
     jobs: Sequence[Job], wanted: Sequence[Job], plan: Plan, display: CollectionDisplay
 ) -> None:
-    """Train the groups of all wanted tasks, as far as that has not been done."""
-    from datagen.fleet.training import FleetJob, train_fleet
+    """Train the groups of all wanted tasks, as far as that has not been done.
+
+    Raises:
+        DatasetError: the file of a group is damaged or of another training.
+        WorkerError: a group could not be trained.
+    """
+    from datagen.fleet.training import FleetJob, check_group, train_fleet
 
     groups = {job.group for job in wanted}
     fleets = [
@@ -246,6 +251,8 @@ def _train(
         for group in plan.groups
         if group in groups
     ]
+    for fleet in fleets:
+        check_group(fleet)
     missing = {job.task for job in wanted}
     for fleet, event in _events(train_fleet, fleets, plan.workers):
         # Some of a group may be finished, where a file of it was lost.

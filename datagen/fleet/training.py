@@ -104,6 +104,12 @@ def learner(work: FleetJob) -> FleetSAC:
     return model
 
 
+def check_group(work: FleetJob) -> None:
+    """Raise a DatasetError if a group has a file that its training cannot go on from."""
+    if work.path.exists():
+        _read(work.path, work.origin)
+
+
 def train_fleet(work: FleetJob, report: Callable[[int], None] = lambda step: None) -> None:
     """Train every task of a group up to the last checkpoint and leave the policies in its file.
 
