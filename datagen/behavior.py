@@ -80,6 +80,30 @@ def training_environment(env: str, task: int) -> gymnasium.Env[Any, Any]:
     return DenseReward(made) if definition(row.name).sparse else made
 
 
+def new_sac(env: str, task: int, budget: Budget, seed: int | None = None) -> SAC:
+    """Stable-Baselines3's SAC of one task as a budget has it, before its first step."""
+    settings = budget.sac
+    return SAC(
+        "MlpPolicy",
+        training_environment(env, task),
+        learning_rate=settings.learning_rate,
+        buffer_size=budget.steps,
+        learning_starts=budget.random_steps,
+        batch_size=settings.batch_size,
+        tau=settings.tau,
+        gamma=settings.gamma,
+        train_freq=settings.update_every,
+        gradient_steps=settings.update_every,
+        ent_coef=f"auto_{settings.initial_temperature}",
+        policy_kwargs={
+            "net_arch": list(settings.hidden),
+            "optimizer_kwargs": {"fused": True},
+        },
+        seed=seed,
+        device="cpu",
+    )
+
+
 def train_policies(
     env: str,
     task: int,
@@ -103,27 +127,8 @@ def train_policies(
         The policy at each of the budget's checkpoints.
     """
     torch.set_num_threads(1)
-    settings = budget.sac
     keep = _KeepCheckpoints(budget.checkpoints, report)
-    model = SAC(
-        "MlpPolicy",
-        training_environment(env, task),
-        learning_rate=settings.learning_rate,
-        buffer_size=budget.steps,
-        learning_starts=budget.random_steps,
-        batch_size=settings.batch_size,
-        tau=settings.tau,
-        gamma=settings.gamma,
-        train_freq=settings.update_every,
-        gradient_steps=settings.update_every,
-        ent_coef=f"auto_{settings.initial_temperature}",
-        policy_kwargs={
-            "net_arch": list(settings.hidden),
-            "optimizer_kwargs": {"fused": True},
-        },
-        seed=seed,
-        device="cpu",
-    )
+    model = new_sac(env, task, budget, seed)
     # Without a logger of its own, each model would leave a folder among the temporary files.
     model.set_logger(Logger(folder=None, output_formats=[]))
     model.learn(budget.steps, callback=keep, log_interval=budget.steps)

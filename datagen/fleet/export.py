@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
+from io import BytesIO
 from pathlib import Path
 
 import torch
 from stable_baselines3 import SAC
 from torch import Tensor
 
-from datagen.behavior import training_environment
+from datagen.behavior import new_sac
 from datagen.budgets import Budget
-from datagen.files import sync_folder
+from datagen.files import write_whole
 
 
 def sac_of(env: str, task: int, budget: Budget, tensors: dict[str, Tensor]) -> SAC:
@@ -24,23 +24,8 @@ def sac_of(env: str, task: int, budget: Budget, tensors: dict[str, Tensor]) -> S
         tensors: the task's part of `FleetPolicy.state_dict()`, without the leading axis, and its
             `log_temperature`.
     """
-    settings = budget.sac
-    model = SAC(
-        "MlpPolicy",
-        training_environment(env, task),
-        learning_rate=settings.learning_rate,
-        buffer_size=budget.steps,
-        learning_starts=budget.random_steps,
-        batch_size=settings.batch_size,
-        tau=settings.tau,
-        gamma=settings.gamma,
-        train_freq=settings.update_every,
-        gradient_steps=settings.update_every,
-        ent_coef=f"auto_{settings.initial_temperature}",
-        policy_kwargs={"net_arch": list(settings.hidden)},
-        device="cpu",
-    )
-    model.policy.load_state_dict(_state(tensors, len(settings.hidden)))
+    model = new_sac(env, task, budget)
+    model.policy.load_state_dict(_state(tensors, len(budget.sac.hidden)))
     assert model.log_ent_coef is not None
     with torch.no_grad():
         model.log_ent_coef.copy_(tensors["log_temperature"].reshape(1))
@@ -73,14 +58,6 @@ def export_policy(path: Path, model: SAC) -> None:
     Raises:
         OSError: the disk is full or the folder is not there.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            model.save(file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+    content = BytesIO()
+    model.save(content)
+    write_whole(path, content.getvalue())
