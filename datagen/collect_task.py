@@ -48,9 +48,9 @@ def _export(job: Job, folder: Path) -> None:
 def collect_task(job: Job, report: Callable[[int], None] = lambda step: None) -> dict[str, Any]:
     """Train a task's behaviour policy, roll its checkpoints out and write the task's file.
 
-    A fleet's policies must have been trained before, by `datagen.fleet.training.train_fleet`.
-
-    The file depends on the job alone: not on other tasks, on the process or on what ran before.
+    A fleet's policies must have been trained before, by `datagen.fleet.training.train_fleet`. The
+    file depends on the job alone: not on the process or on what ran before, nor on other tasks, but
+    for the last digits of a fleet's weights, which depend on the job's group.
 
     Args:
         job: what to do.

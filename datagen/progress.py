@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from datagen.budgets import Budget
 
 FLEET_ROLLOUTS = 0.2
-"""About the part of a fleet's collection that comes after its training; only estimates use it."""
+"""A guess at the part of a fleet's collection that comes after its training, for the time left."""
 
 
 class TimeLeft:

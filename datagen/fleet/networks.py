@@ -135,7 +135,7 @@ class _Pass(torch.autograd.Function):
             if layer == 0 and not ctx.needs_input_grad[0]:
                 return (None, None, *nothing)
             across = net.lower[layer][0].transpose(1, 2)
-            # Of a single output this is an outer product, which bmm takes four times as long for.
+            # Of a single output this is an outer product, which needs no product of matrices.
             outer = across.shape[1] == 1
             gradient = gradient * across if outer else torch.bmm(gradient, across)
             if layer > 0:
