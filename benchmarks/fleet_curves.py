@@ -24,7 +24,7 @@ from rich.table import Table
 from scipy import stats
 
 from datagen.budgets import BUDGETS, Budget, FleetSettings, budget
-from datagen.collect import collect
+from datagen.collect import CollectionError, InterruptedCollectionError, collect
 from datagen.fleet.networks import best_precision
 from datagen.plan import Plan
 from meta_envs import resolve, task_set
@@ -99,8 +99,25 @@ def draw(curves: dict[str, NDArray[np.float64]], marks: list[int], title: str, p
 
 
 def main() -> int:
-    """Run the comparison."""
-    options, console = tyro.cli(Curves), Console()
+    """Run the comparison and return its exit code."""
+    options, errors = tyro.cli(Curves), Console(stderr=True)
+    try:
+        compare(options, Console())
+    except (ValueError, CollectionError, InterruptedCollectionError) as error:
+        errors.print(str(error), soft_wrap=True, markup=False, highlight=False)
+        codes = {CollectionError: 1, InterruptedCollectionError: 130}
+        return codes.get(type(error), 2)
+    return 0
+
+
+def compare(options: Curves, console: Console) -> None:
+    """Collect what is missing and compare.
+
+    Raises:
+        ValueError: an option is wrong.
+        CollectionError: a collection failed.
+        InterruptedCollectionError: Ctrl-C.
+    """
     name = resolve(options.env).name
     rows = np.linspace(0, len(task_set(name)) - 1, options.tasks).round().astype(int)
     curves: dict[str, NDArray[np.float64]] = {}
@@ -142,7 +159,6 @@ def main() -> int:
     console.print(table)
     for engine, count in inside.items():
         console.print(f"{engine}: within sb3's interval at {count} of {len(marks)} checkpoints")
-    return 0
 
 
 if __name__ == "__main__":
