@@ -14,13 +14,15 @@ from datagen.budgets import Precision
 
 
 def best_precision(device: torch.device | str = "cpu") -> Precision:
-    """bfloat16 where the hardware multiplies matrices of it, float32 elsewhere."""
+    """bfloat16 where the hardware has units for its matrix products, float32 elsewhere.
+
+    AVX-512 can multiply bfloat16 too, but slower than float32 (docs/fleet.md).
+    """
     if torch.device(device).type == "cuda":
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     # Older versions of torch cannot tell.
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    able = capabilities.get("amx_bf16") or capabilities.get("avx512_bf16")
-    return "bfloat16" if able else "float32"
+    return "bfloat16" if capabilities.get("amx_bf16") else "float32"
 
 
 def check_precision(precision: str, device: str) -> Precision:
