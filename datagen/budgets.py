@@ -166,14 +166,16 @@ def _rows(paper: Budget) -> dict[str, Budget]:
     return {row.name: row for row in rows}
 
 
+# The field's discount, target rate and first temperature. Of networks and rates this learns most in
+# an hour of a small machine; docs/fleet.md has its learning curves.
 _ROBOT_SAC = SACSettings(
-    hidden=(128, 128),
-    learning_rate=3e-4,
-    batch_size=256,
+    hidden=(64, 64),
+    learning_rate=1e-3,
+    batch_size=128,
     gamma=0.99,
     tau=0.005,
     update_every=20,
-    initial_temperature=1.0,
+    initial_temperature=0.1,
 )
 _ROBOT_STANDARD = Budget(
     name="standard",

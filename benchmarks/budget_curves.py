@@ -1,0 +1,207 @@
+r"""How many steps a behaviour policy needs: learning curves at four times the standard budget.
+
+    python benchmarks/budget_curves.py --env half_cheetah_vel --work ~/budget_curves
+
+Collects train tasks of an environment with the standard budget's fleet, but for four times its
+steps (killed and run again, it goes on). A policy's worth after a number of steps is the best mean
+return of any checkpoint so far, above the random policy's; the table has its mean over tasks, and
+its share of what four times these steps reach. Writes benchmarks/results/budget_curves_ENV.csv,
+and docs/results/budget_curves.png with all environments that have such a file.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from datagen.budgets import BUDGETS, Budget, budget
+from datagen.collect import CollectConfig, CollectionError, InterruptedCollectionError, collect
+from datagen.collect import with_engine as engine_of
+from datagen.plan import Plan
+from meta_envs import resolve, task_set
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks/results"
+TIMES, PARTS = 4, 10
+"""So many times the standard budget's steps, and so many checkpoints in each of those times."""
+ENOUGH = 0.9
+"""Share of what four times the steps reach that a budget must reach."""
+FIRST = ("task", "random")
+"""Columns of a file before those of the checkpoints."""
+
+
+@dataclass(frozen=True)
+class BudgetCurves:
+    """Learning curves of behaviour policies at four times the standard budget's steps."""
+
+    env: str
+    """Environment."""
+    work: Path
+    """Folder for the datasets, outside the repository."""
+    tasks: int = 8
+    """Number of train tasks, spread over them."""
+    fleet_size: int = 4
+    """Tasks of a group; a process trains a group."""
+    workers: int = 2
+    """Processes, one thread each."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What a file of results holds.
+
+    Attributes:
+        tasks: rows of the task set, [T].
+        random: the random policy's return on each, [T].
+        marks: steps of the checkpoints, [C].
+        returns: mean return of each checkpoint's episodes, [T, C].
+    """
+
+    tasks: NDArray[np.int64]
+    random: NDArray[np.float64]
+    marks: NDArray[np.int64]
+    returns: NDArray[np.float64]
+
+    @property
+    def worth(self) -> NDArray[np.float64]:
+        """Best mean return so far above the random policy's, mean over tasks, [C]."""
+        best = np.maximum.accumulate(self.returns, axis=1) - self.random[:, None]
+        return best.mean(axis=0)
+
+    @property
+    def shares(self) -> dict[int, float]:
+        """Steps -> worth there as a share of the worth at four times these steps."""
+        worth = dict(zip(self.marks.tolist(), self.worth.tolist(), strict=True))
+        return {
+            mark: value / worth[TIMES * mark]
+            for mark, value in worth.items()
+            if TIMES * mark in worth
+        }
+
+
+def long_budget(env: str) -> Budget:
+    """The standard budget for four times its steps."""
+    row = budget(env, "standard")
+    every = row.steps // PARTS
+    marks = tuple(range(every, TIMES * row.steps + 1, every))
+    return replace(row, name="curves", steps=marks[-1], checkpoints=marks)
+
+
+def measure(options: BudgetCurves, console: Console) -> Curves:
+    """Collect what is missing and read the returns.
+
+    Raises:
+        ValueError: an option is wrong.
+        CollectionError: a collection failed.
+        InterruptedCollectionError: Ctrl-C.
+    """
+    name = resolve(options.env).name
+    row = long_budget(name)
+    # A dataset's card looks its budget up.
+    BUDGETS[name] = {**BUDGETS[name], row.name: row}
+    row = engine_of(row, CollectConfig(name, fleet_size=options.fleet_size))
+    train = task_set(name).train_tasks
+    tasks = train[np.linspace(0, len(train) - 1, options.tasks).round().astype(int)]
+    plan = Plan(name, tuple(tasks.tolist()), row, 0, options.work / name, options.workers)
+    records = collect(plan, console)["tasks"]
+    return Curves(
+        tasks,
+        np.array([one["returns"]["random"] for one in records]),
+        np.array(row.checkpoints),
+        np.array(
+            [[one["returns"]["behavior"][str(mark)] for mark in row.checkpoints] for one in records]
+        ),
+    )
+
+
+def write(curves: Curves, path: Path) -> None:
+    """One row a task."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*FIRST, *curves.marks])
+        for task, random, returns in zip(curves.tasks, curves.random, curves.returns, strict=True):
+            writer.writerow([task, float(random), *map(float, returns)])
+
+
+def read(path: Path) -> Curves:
+    """What `write` wrote."""
+    with path.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    values = np.array(rows, dtype=np.float64)
+    skip = len(FIRST)
+    marks = np.array(header[skip:], dtype=np.int64)
+    return Curves(values[:, 0].astype(np.int64), values[:, 1], marks, values[:, skip:])
+
+
+def draw(path: Path) -> None:
+    """The picture: a panel an environment, the checkpoints' returns and the best so far."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    files = sorted(RESULTS.glob("budget_curves_*.csv"))
+    figure, panels = pyplot.subplots(
+        1, len(files), figsize=(3.2 * len(files), 3), layout="constrained", squeeze=False
+    )
+    for axes, file in zip(panels[0], files, strict=True):
+        curves = read(file)
+        steps = curves.marks / 1000
+        axes.plot(steps, curves.returns.T, color="#3b6ea5", alpha=0.25, linewidth=0.8)
+        best = curves.worth + curves.random.mean()
+        axes.plot(steps, best, color="#c1666b", label="best so far, mean")
+        axes.axhline(curves.random.mean(), color="0.6", linestyle=":", label="random")
+        name = file.stem.removeprefix("budget_curves_")
+        axes.axvline(budget(name, "standard").steps / 1000, color="0.3", linestyle="--")
+        axes.set(xlabel="thousand steps", title=resolve(name).id)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0][0].set_ylabel("behaviour policy's return")
+    panels[0][0].legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def report(curves: Curves, title: str, console: Console) -> None:
+    """The table, and the fewest steps that are enough."""
+    table = Table("steps", "return", "best so far", "share of 4 x the steps", title=title)
+    for place, mark in enumerate(curves.marks.tolist()):
+        best = curves.worth[place] + curves.random.mean()
+        share = curves.shares.get(mark)
+        table.add_row(
+            f"{mark:,}",
+            f"{curves.returns[:, place].mean():.1f}",
+            f"{best:.1f}",
+            "" if share is None else f"{share:.2f}",
+        )
+    console.print(table)
+    enough = [mark for mark, share in curves.shares.items() if share >= ENOUGH]
+    console.print(
+        f"fewest steps with {ENOUGH:.0%} of what {TIMES} times the steps reach: "
+        f"{min(enough, default='none of these')}"
+    )
+
+
+def main() -> int:
+    """Run the experiment and return its exit code."""
+    options, errors = tyro.cli(BudgetCurves), Console(stderr=True)
+    try:
+        curves = measure(options, Console())
+    except (ValueError, CollectionError, InterruptedCollectionError) as error:
+        errors.print(str(error), soft_wrap=True, markup=False, highlight=False)
+        codes = {CollectionError: 1, InterruptedCollectionError: 130}
+        return codes.get(type(error), 2)
+    name = resolve(options.env).name
+    write(curves, RESULTS / f"budget_curves_{name}.csv")
+    draw(ROOT / "docs/results/budget_curves.png")
+    report(curves, f"{resolve(name).id}: {len(curves.tasks)} train tasks", Console())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
