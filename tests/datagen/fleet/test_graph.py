@@ -219,8 +219,8 @@ def test_a_gpu_learns_as_a_processor_does(precision: Precision, tmp_path: Path) 
         model.train(WARM_UP + 20, SETTINGS.batch_size)
     assert isinstance(gpu._recorded, Recorded)
     assert gpu._recorded._graph is not None
-    # As those of float32 and bfloat16 are allowed to differ, and a tenth of that.
-    bound = 0.05 if precision == "float32" else 0.5
+    # On one processor, rows of the memory that are 1e-6 larger make 2e-6 and 1e-3 of a difference.
+    bound = 1e-3 if precision == "float32" else 0.1
     for name, value in processor.policy.state_dict().items():
         moved = torch.linalg.norm(value - begin[name])
         other = gpu.policy.state_dict()[name].cpu()
