@@ -67,7 +67,8 @@ class CollectConfig:
     sb3 is Stable-Baselines3's SAC, a process a task. By default sb3 for point robots, and a fleet
     for MuJoCo."""
     fleet_size: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Tasks a fleet learns side by side, at most; a setting of the budget by default."""
+    """Tasks a fleet learns side by side, at most; by default a setting of the budget, and on a GPU
+    all of the environment's."""
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"], tyro.conf.arg(metavar="auto|float32|bfloat16")
     ] = "auto"
@@ -139,6 +140,8 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
         if config.fleet_size < 1:
             raise ValueError(f"--fleet-size must be at least 1, got {config.fleet_size}")
         fleet = replace(fleet, size=config.fleet_size)
+    elif config.device.startswith("cuda"):
+        fleet = replace(fleet, size=len(task_set(config.env)))
     # Loads torch, which --help and mistakes need not wait for.
     from datagen.fleet.networks import check_precision
 

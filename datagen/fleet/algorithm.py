@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import Tensor
+from torch.optim import Optimizer
 
 from datagen.budgets import Precision, SACSettings
+from datagen.fleet.graph import Inlet, recorded
 from datagen.fleet.memory import FleetMemory
 from datagen.fleet.policy import FleetPolicy
 from datagen.fleet.vec_env import FleetVecEnv
@@ -91,6 +93,30 @@ class FleetSAC(OffPolicyAlgorithm):
         self.temperature_optimizer = torch.optim.Adam(
             [self.log_temperature], lr=self.lr_schedule(1.0), fused=True
         )
+        self.log_temperature.grad = torch.zeros_like(self.log_temperature)
+        self._losses = torch.zeros(3, device=self.device)
+        tasks, acts = self.n_envs, self.policy.action_dim
+        self._rows, *self._noises = (
+            Inlet((tasks, self.batch_size, size), self.device)
+            for size in (self.replay_buffer.rows.shape[2], acts, acts)
+        )
+        for optimizer in self.optimizers.values():
+            for group in optimizer.param_groups:
+                group["capturable"] = self.device.type == "cuda"
+        self.record()
+
+    @property
+    def optimizers(self) -> dict[str, Optimizer]:
+        """All of them, by name."""
+        return {
+            "actor_optimizer": self.policy.actor_optimizer,
+            "critic_optimizer": self.policy.critic_optimizer,
+            "temperature_optimizer": self.temperature_optimizer,
+        }
+
+    def record(self) -> None:
+        """Have the updates recorded anew, because tensors were replaced, as optimisers' are."""
+        self._recorded = recorded(self._update, self.device)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -107,35 +133,48 @@ class FleetSAC(OffPolicyAlgorithm):
         return actions, actions
 
     def train(self, gradient_steps: int, batch_size: int) -> None:
-        """Updates of every task; the mean losses over tasks go to the logger."""
-        losses = torch.zeros(3)
+        """Updates of every task; the mean losses over tasks go to the logger.
+
+        Raises:
+            ValueError: a batch size other than the settings'.
+        """
+        if batch_size != self.batch_size:
+            raise ValueError(f"batches are of {self.batch_size} transitions, not {batch_size}")
+        self._losses.zero_()
         for _ in range(gradient_steps):
-            losses += self._update(batch_size)
+            self._rows.fill(self.replay_buffer.draw)
+            for noise in self._noises:
+                noise.fill(self.policy.draw_noise)
+            self._recorded()
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         names = ("train/actor_loss", "train/critic_loss", "train/ent_coef_loss")
-        means = (losses / gradient_steps / self.n_envs).tolist()
+        means = (self._losses / gradient_steps / self.n_envs).tolist()
         for name, mean in zip(names, means, strict=True):
             self.logger.record(name, mean)
         self.logger.record("train/ent_coef", float(self.log_temperature.detach().exp().mean()))
 
-    def _update(self, batch_size: int) -> Tensor:
+    def _update(self) -> None:
         """One update of temperature, critics and actor, in Stable-Baselines3's order.
 
         Every loss is the sum over tasks of a task's mean, so that no task weighs on another.
-        Returns the losses of the actors, the critics and the temperatures, [3].
+        Reads the inlets, adds to the losses of the actors, the critics and the temperatures, and
+        is recorded on a GPU: nothing here may wait for a value or keep a tensor it has made.
         """
         policy = self.policy
-        batch = self.replay_buffer.sample(batch_size)
-        action, log_prob = policy.act(batch.observations, policy.noise(batch_size))
+        batch = self.replay_buffer.split(self._rows.tensor)
+        noise, next_noise = (one.tensor for one in self._noises)
+        action, log_prob = policy.act(batch.observations, noise)
 
         temperature = self.log_temperature.detach().exp()
         short = (log_prob - policy.action_dim).detach()
         temperature_loss = -(self.log_temperature * short).mean(dim=1).sum()
-        self.log_temperature.grad = torch.autograd.grad(temperature_loss, self.log_temperature)[0]
+        (gradient,) = torch.autograd.grad(temperature_loss, self.log_temperature)
+        assert self.log_temperature.grad is not None
+        self.log_temperature.grad.copy_(gradient)
         self.temperature_optimizer.step()
 
-        target = self._target(batch, temperature, policy.noise(batch_size))
+        target = self._target(batch, temperature, next_noise)
         pairs = torch.cat([batch.observations, batch.actions], dim=2)
         critic_loss = torch.zeros((), device=self.device)
         for critic in policy.critics:
@@ -153,7 +192,7 @@ class FleetSAC(OffPolicyAlgorithm):
         policy.actor.refresh()
 
         self._follow()
-        return torch.stack([actor_loss, critic_loss, temperature_loss]).detach().cpu()
+        self._losses += torch.stack([actor_loss, critic_loss, temperature_loss]).detach()
 
     @torch.no_grad()
     def _target(self, batch: Any, temperature: Tensor, noise: Tensor) -> Tensor:

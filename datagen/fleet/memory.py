@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import Tensor
 
 
 class FleetMemory(BaseBuffer):
@@ -77,15 +78,23 @@ class FleetMemory(BaseBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Transitions drawn with replacement, tensors [task, batch, ...]."""
-        drawn = [one.integers(self.pos, size=batch_size) for one in self._generators]
-        return self._get_samples(np.stack(drawn), env)
+        rows = np.empty((self.n_envs, batch_size, self.rows.shape[2]), dtype=np.float32)
+        self.draw(rows)
+        return self.split(torch.from_numpy(rows).to(self.device))
+
+    def draw(self, into: NDArray[np.float32]) -> None:
+        """Write rows drawn with replacement to an array [task, batch, row]."""
+        steps = np.stack([one.integers(self.pos, size=into.shape[1]) for one in self._generators])
+        flat = steps * self.n_envs + np.arange(self.n_envs)[:, None]
+        # No step is out of bounds; to check that, NumPy would fill another array first.
+        self.rows.reshape(-1, into.shape[2]).take(flat, axis=0, out=into, mode="clip")
+
+    def split(self, rows: Tensor) -> ReplayBufferSamples:
+        """The parts of rows [task, batch, row], views of the same memory."""
+        obs, action, next_obs, reward, done = rows.tensor_split(self._ends.tolist(), dim=2)
+        return ReplayBufferSamples(obs, action, next_obs, done, reward)
 
     def _get_samples(
         self, batch_inds: NDArray[np.int64], env: VecNormalize | None = None
     ) -> ReplayBufferSamples:
-        """Transitions of steps [task, batch]."""
-        flat = batch_inds * self.n_envs + np.arange(self.n_envs)[:, None]
-        found = self.rows.reshape(-1, self.rows.shape[2]).take(flat, axis=0)
-        rows = torch.from_numpy(found).to(self.device)
-        obs, action, next_obs, reward, done = rows.tensor_split(self._ends.tolist(), dim=2)
-        return ReplayBufferSamples(obs, action, next_obs, done, reward)
+        raise NotImplementedError("a fleet's tasks have steps of their own, which sample() draws")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import Tensor
@@ -91,9 +92,13 @@ class FleetPolicy(BasePolicy):
     def noise(self, batch_size: int) -> Tensor:
         """Standard normal numbers [task, batch, A], each task's from its own generator."""
         drawn = np.empty((len(self.generators), batch_size, self.action_dim), dtype=np.float32)
-        for row, generator in zip(drawn, self.generators, strict=True):
-            generator.standard_normal(dtype=np.float32, out=row)
+        self.draw_noise(drawn)
         return torch.from_numpy(drawn).to(self.device)
+
+    def draw_noise(self, into: NDArray[np.float32]) -> None:
+        """Write such numbers to an array [task, batch, A]."""
+        for row, generator in zip(into, self.generators, strict=True):
+            generator.standard_normal(dtype=np.float32, out=row)
 
     def refresh(self) -> None:
         """Make every network see its parameters, after they were loaded."""

@@ -12,7 +12,6 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
-from torch.optim import Optimizer
 
 from datagen.files import canonical_json, parse_canonical, sync_folder, unreadable
 from datagen.fleet.algorithm import FleetSAC
@@ -86,7 +85,7 @@ def learner_tensors(model: FleetSAC) -> dict[str, Tensor]:
     """Everything a learner's next update depends on, but for its generators."""
     memory, tensors = model.replay_buffer, network_tensors(model)
     tensors["memory"] = torch.from_numpy(memory.rows[: memory.pos])
-    for name, optimizer in _optimizers(model).items():
+    for name, optimizer in model.optimizers.items():
         for index, state in optimizer.state_dict()["state"].items():
             for key, value in state.items():
                 tensors[f"{name}.{index}.{key}"] = value
@@ -124,21 +123,14 @@ def _restore(model: FleetSAC, tensors: Mapping[str, Tensor], counts: Mapping[str
     rows = tensors["memory"].numpy()
     model.replay_buffer.rows[: len(rows)] = rows
     model.replay_buffer.pos = len(rows)
-    for name, optimizer in _optimizers(model).items():
+    for name, optimizer in model.optimizers.items():
         held = optimizer.state_dict()
         held["state"] = _optimizer_state(name, tensors)
         optimizer.load_state_dict(held)
+    model.record()
     model.num_timesteps, model._n_updates = counts["timesteps"], counts["updates"]
     for generator, state in zip(model.generators, counts["generators"], strict=True):
         generator.bit_generator.state = state
-
-
-def _optimizers(model: FleetSAC) -> dict[str, Optimizer]:
-    return {
-        "actor_optimizer": model.policy.actor_optimizer,
-        "critic_optimizer": model.policy.critic_optimizer,
-        "temperature_optimizer": model.temperature_optimizer,
-    }
 
 
 def _optimizer_state(name: str, tensors: Mapping[str, Tensor]) -> dict[int, dict[str, Tensor]]:

@@ -51,12 +51,13 @@ def fleet(
     random_steps: int = 40,
     precision: Precision = "float32",
     settings: SACSettings = SETTINGS,
+    device: str = "cpu",
 ) -> FleetSAC:
     """A fleet at its start; a task's seeds depend on its number alone."""
     many = FleetVecEnv(env, tasks)
     many.seed_tasks([100 + task for task in tasks])
     seeds = [np.random.SeedSequence([3, task]) for task in tasks]
-    model = FleetSAC(many, settings, seeds, steps, random_steps, precision)
+    model = FleetSAC(many, settings, seeds, steps, random_steps, precision, device)
     model.set_logger(Logger(folder=None, output_formats=[]))
     return model
 

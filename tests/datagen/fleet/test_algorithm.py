@@ -105,14 +105,14 @@ def of_fleet(model: FleetSAC, row: int) -> dict[str, list[NDArray[np.float32]]]:
 
 
 class Recorder:
-    """Calls a function and keeps what it returned."""
+    """Calls a function that writes to an array, and keeps what it wrote."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function, self.returned = function, list[Any]()
+    def __init__(self, function: Callable[[NDArray[np.float32]], None]) -> None:
+        self.function, self.written = function, list[Tensor]()
 
-    def __call__(self, *arguments: Any) -> Any:
-        self.returned.append(self.function(*arguments))
-        return self.returned[-1]
+    def __call__(self, into: NDArray[np.float32]) -> None:
+        self.function(into)
+        self.written.append(torch.from_numpy(into.copy()))
 
 
 @pytest.mark.parametrize("updates", [1, 4])
@@ -128,26 +128,21 @@ def test_an_update_is_stable_baselines3s(updates: int, monkeypatch: pytest.Monke
         for optimizer in (sac.actor.optimizer, sac.critic.optimizer, sac.ent_coef_optimizer):
             assert optimizer is not None
             assert not optimizer.state
-    for optimizer in (
-        model.policy.actor_optimizer,
-        model.policy.critic_optimizer,
-        model.temperature_optimizer,
-    ):
+    for optimizer in model.optimizers.values():
         optimizer.state.clear()
     before = [of_fleet(model, row) for row in range(2)]
-    batches = Recorder(model.replay_buffer.sample)
-    noises = Recorder(model.policy.noise)
-    monkeypatch.setattr(model.replay_buffer, "sample", batches)
-    monkeypatch.setattr(model.policy, "noise", noises)
+    draws = Recorder(model.replay_buffer.draw)
+    noises = Recorder(model.policy.draw_noise)
+    monkeypatch.setattr(model.replay_buffer, "draw", draws)
+    monkeypatch.setattr(model.policy, "draw_noise", noises)
     model.train(updates, SETTINGS.batch_size)
-    assert len(batches.returned) == updates
-    assert len(noises.returned) == 2 * updates
-    assert any(0 < batch.dones.mean() < 1 for batch in batches.returned)
+    assert len(draws.written) == updates
+    assert len(noises.written) == 2 * updates
+    batches = [model.replay_buffer.split(rows) for rows in draws.written]
+    assert any(0 < batch.dones.mean() < 1 for batch in batches)
     for row, sac in enumerate(sacs):
-        rows = iter(
-            [ReplayBufferSamples(*(part[row] for part in one[:5])) for one in batches.returned]
-        )
-        drawn = iter([noise[row] for noise in noises.returned])
+        rows = iter([ReplayBufferSamples(*(part[row] for part in one[:5])) for one in batches])
+        drawn = iter([noise[row] for noise in noises.written])
         monkeypatch.setattr(
             "torch.distributions.normal._standard_normal",
             lambda *about, drawn=drawn, **more: next(drawn),

@@ -11,11 +11,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
+import torch
 from stable_baselines3 import SAC
 
 from datagen import check
@@ -127,6 +129,21 @@ def test_the_default_engines() -> None:
     assert fleet == FleetSettings(50, best_precision())
 
 
+@pytest.mark.parametrize("device", ["cuda", "cuda:1"])
+def test_a_gpu_has_all_tasks_at_once(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("datagen.fleet.networks.check_precision", lambda *about: "float32")
+    many = CollectConfig("half-cheetah-vel", "smoke", device=device, workers=3)
+    assert plan_of(many).groups == (tuple(range(100)),)
+    # The budget of a few tasks is that of all, so that the others can be added.
+    few = plan_of(replace(many, tasks="3,5,60"))
+    assert few.groups == ((3, 5, 60),)
+    assert few.budget == plan_of(many).budget
+    assert len(plan_of(replace(many, fleet_size=25)).groups) == 4
+    assert len(plan_of(replace(many, device="cpu")).groups) == 4
+    points = CollectConfig("point_robot", "smoke", engine="fleet", device=device)
+    assert len(plan_of(points).groups) == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -140,6 +157,11 @@ def test_the_default_engines() -> None:
         ((*HOPPERS, "--fleet-size", "0"), "--fleet-size must be at least 1, got 0"),
         ((*HOPPERS, "--device", "nonsense"), "--device nonsense cannot be used here: "),
         ((*HOPPERS, "--device", "cuda:99"), "--device cuda:99 cannot be used here: "),
+        pytest.param(
+            (*HOPPERS, "--device", "cuda"),
+            "--device cuda cannot be used here: ",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
+        ),
     ],
 )
 def test_mistakes_are_one_sentence(

@@ -111,6 +111,25 @@ def test_a_tasks_samples_do_not_depend_on_the_others() -> None:
     assert not torch.equal(drawn, (three.sample(64).observations[:, :, 0] // 1000).int())
 
 
+def test_rows_are_drawn_into_an_array_and_split_where_they_are() -> None:
+    held, again = memory(9), memory(9)
+    for step in range(9):
+        add(held, step)
+        add(again, step)
+    into = np.zeros((2, 64, 2 * OBS + ACTS + 2), np.float32)
+    held.draw(into)
+    parts, wanted = held.split(torch.from_numpy(into)), again.sample(64)
+    for part, one in zip(parts[:5], wanted[:5], strict=True):
+        assert torch.equal(part, one)
+    into[:] = 5.0
+    assert all((part == 5.0).all() for part in parts[:5])
+
+
+def test_steps_are_not_shared() -> None:
+    with pytest.raises(NotImplementedError, match="tasks have steps of their own"):
+        memory(1)._get_samples(np.zeros(1, np.int64))
+
+
 def test_it_never_overwrites() -> None:
     held = memory(2)
     add(held, 0)
