@@ -43,9 +43,11 @@ def through_a_file(config: RunConfig) -> dict[str, Any]:
 def test_it_builds(config: RunConfig) -> None:
     tasks = task_set(config.env)
     dims = Dimensions(2, 2, len(tasks.train_tasks), config.training.steps)
-    statistics = empty_statistics(dims, config.context.next_obs_in_context)
+    params = len(tasks.param_names)
+    statistics = empty_statistics(dims, config.context.next_obs_in_context, params)
     method = build_method(config, statistics, dims)
-    assert method.encoder.z_dim == config.context.z_dim
+    sizes = {"oracle_task": params}
+    assert method.encoder.z_dim == sizes.get(config.method, config.context.z_dim)
     assert isinstance(method, METHODS[config.method].method)
     assert type(config.context) is METHODS[config.method].config
 
