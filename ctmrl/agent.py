@@ -10,6 +10,7 @@ from ctmrl.config import RunConfig
 from ctmrl.methods import METHODS
 from ctmrl.methods.base import Dimensions, Method
 from ctmrl.networks import Actor, Statistics
+from meta_envs import task_set
 
 
 @dataclass(frozen=True)
@@ -29,10 +30,10 @@ def build_method(config: RunConfig, statistics: Statistics, dims: Dimensions) ->
     return METHODS[config.method].method(config.context, statistics, dims)
 
 
-def empty_statistics(dims: Dimensions, next_obs_in_context: bool) -> Statistics:
+def empty_statistics(dims: Dimensions, next_obs_in_context: bool, params: int) -> Statistics:
     """Statistics of the right sizes, for networks whose values a checkpoint will bring."""
     seen = dims.obs + dims.act + 1 + dims.obs * next_obs_in_context
-    sizes = (dims.obs, seen, 1 + dims.obs)
+    sizes = (dims.obs, seen, 1 + dims.obs, params)
     return Statistics(*((torch.zeros(size), torch.ones(size)) for size in sizes))
 
 
@@ -47,11 +48,13 @@ def load_agent(config: RunConfig, dims: Dimensions, state: dict[str, torch.Tenso
     Raises:
         RuntimeError: the checkpoint does not fit the settings.
     """
-    statistics = empty_statistics(dims, config.context.next_obs_in_context)
+    params = len(task_set(config.env).param_names)
+    statistics = empty_statistics(dims, config.context.next_obs_in_context, params)
     # Initial weights are drawn from torch's global generator, though none of them stays.
     with torch.random.fork_rng():
         method = build_method(config, statistics, dims)
-        actor = Actor(statistics.obs, config.context.z_dim, config.actor_critic.hidden, dims.act)
+        z_dim = method.encoder.z_dim
+        actor = Actor(statistics.obs, z_dim, config.actor_critic.hidden, dims.act)
     method.load_state_dict(part(state, "method/"))
     actor.load_state_dict(part(state, "actor_critic/actor."))
     return Agent(method, actor)

@@ -51,7 +51,8 @@ class RunConfig:
     env: str = "point_robot_wind"
     """Environment: short name, id or hyphenated name."""
     method: str = "ctmrl"
-    """Context-learning method: ctmrl, ctmrl_released (as its published code has it) or focal."""
+    """Context-learning method: ctmrl, ctmrl_released (as its published code has it) or focal; or a
+    reference: oracle_task (given the true task) or no_context."""
     preset: Preset = "standard"
     """Where the defaults of all other options come from: standard, paper (sizes of the field, hours
     on a small machine) or smoke (seconds, learns little)."""

@@ -54,6 +54,7 @@ class OfflineData:
         tasks: int64 [T], the tasks' rows in the environment's task set.
         obs_dim: O.
         act_dim: A.
+        params: float32 [T, P], the tasks' true parameters, which no method but a reference sees.
     """
 
     def __init__(
@@ -76,6 +77,8 @@ class OfflineData:
         """
         self.tasks = np.asarray(tasks, dtype=np.int64)
         self._part = dataset.part
+        rows = np.searchsorted(dataset.tasks, self.tasks)
+        self.params = torch.tensor(dataset.params[rows], dtype=torch.float32)
         tables, lengths = [], []
         for task in tasks:
             # One task's columns at a time: of the others there are only rows of the table.
@@ -102,14 +105,15 @@ class OfflineData:
         return int(self._task_episodes.min())
 
     def statistics(self, next_obs_in_context: bool) -> Statistics:
-        """Mean and standard deviation of the columns, over all tasks here."""
+        """Mean and standard deviation of the columns and parameters, over all tasks here."""
         obs = self.table[:, : self.obs_dim]
         context = self.table[:, self._layout.context]
         change = context[:, -self.obs_dim :] - obs
         before = context[:, : -self.obs_dim]
         seen = torch.cat([before, change], dim=1) if next_obs_in_context else before
         target = torch.cat([before[:, -1:], change], dim=1)
-        return Statistics(*((x.mean(dim=0), x.std(dim=0)) for x in (obs, seen, target)))
+        columns = (obs, seen, target, self.params)
+        return Statistics(*((x.mean(dim=0), x.std(dim=0)) for x in columns))
 
     def transitions(self, tasks: Tensor, n: int, generator: torch.Generator) -> Transitions:
         """Draw n transitions a task, uniformly with replacement, [B * n, ...]."""

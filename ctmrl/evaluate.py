@@ -75,6 +75,8 @@ def evaluate_agent(
         "param_names": list(tasks.param_names),
         "groups": {},
     }
+    if agent.method.note:
+        record["note"] = agent.method.note
     for name, rows in groups.items():
         result = meta_test(agent.method.encoder, agent.actor, tasks, rows, config.meta_test, seed)
         anchors = {key: float(values[rows].mean()) for key, values in references.items()}

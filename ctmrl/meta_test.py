@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ctmrl.networks import Actor, ContextEncoder
+from ctmrl.networks import Actor, Encoder
 from meta_envs import MetaVectorEnv, TaskSet
 
 Floats = NDArray[np.float64]
@@ -49,12 +49,11 @@ class MetaTestResult(NamedTuple):
 class _Adaptation:
     """Many tasks side by side in one vector environment, each with a context that grows."""
 
-    def __init__(
-        self, env: MetaVectorEnv, encoder: ContextEncoder, actor: Actor, seed: int
-    ) -> None:
+    def __init__(self, env: MetaVectorEnv, encoder: Encoder, actor: Actor, seed: int) -> None:
         self.env, self.encoder, self.actor = env, encoder, actor
         self.dense = encoder.sees_dense_reward and env.definition.sparse
         self.shape = env.action_space.shape or ()
+        self.params = torch.tensor(env.params, dtype=torch.float32)
         self.noise = np.random.default_rng(seed)
         self.generator = torch.Generator().manual_seed(seed)
         self.total = torch.zeros(env.num_envs, encoder.z_dim, dtype=torch.float64)
@@ -63,8 +62,9 @@ class _Adaptation:
 
     @property
     def z(self) -> Tensor:
-        """Contexts so far, [num_envs, Z]; 0 before the first transition."""
-        return (self.total / self.count.clamp_min(1.0)).float()
+        """What the policy is given: contexts so far, [num_envs, Z]; 0 before any transition."""
+        mean = (self.total / self.count.clamp_min(1.0)).float()
+        return self.encoder.told(mean, self.params)
 
     def random(self, obs: Tensor) -> NDArray[np.float32]:
         """Uniform actions."""
@@ -101,7 +101,7 @@ class _Adaptation:
 
 @torch.no_grad()
 def meta_test(
-    encoder: ContextEncoder,
+    encoder: Encoder,
     actor: Actor,
     tasks: TaskSet,
     rows: NDArray[np.int64],

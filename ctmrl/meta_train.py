@@ -42,7 +42,7 @@ class Learner:
             torch.manual_seed(config.seed)
             self.method = build_method(config, statistics, dims)
             self.actor_critic = ActorCritic(
-                config.actor_critic, statistics, data.act_dim, config.context.z_dim
+                config.actor_critic, statistics, data.act_dim, self.method.encoder.z_dim
             )
         data.check_episodes(self.method.context_sets, config.training.context_episodes)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -94,7 +94,7 @@ class Learner:
         z = method.encoder(contexts)
         context_loss, metrics = method.context_loss(contexts, z, self.generator)
         # The first set's contexts, detached: the actor-critic must not train the encoder.
-        given = z[0].detach()
+        given = method.encoder.told(z[0].detach(), self.data.params[tasks])
         repeated = given.repeat_interleave(config.batch_size, dim=0)
         policy_loss, more = self.actor_critic.loss(batch, repeated, self.generator)
         self.optimizers["main"].zero_grad()

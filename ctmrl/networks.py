@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -51,15 +52,56 @@ class Statistics(NamedTuple):
         obs: two tensors [O].
         context: two tensors [O + A + 1 (+ O)], of (s, a, r) and, where contexts have it, s' - s.
         target: two tensors [1 + O], of (r, s' - s), what the predictors predict.
+        params: two tensors [P], of the tasks' parameters.
     """
 
     obs: tuple[Tensor, Tensor]
     context: tuple[Tensor, Tensor]
     target: tuple[Tensor, Tensor]
+    params: tuple[Tensor, Tensor]
 
 
-class ContextEncoder(nn.Module):
-    """e(h): context transitions -> encodings in (-1, 1); a context is their mean."""
+class Encoder(nn.Module, ABC):
+    """Context transitions -> encodings of size Z; a context is their mean.
+
+    Attributes:
+        z_dim: Z.
+        sees_dense_reward: whether r is the dense reward of a sparse environment.
+    """
+
+    def __init__(self, z_dim: int, sees_dense_reward: bool = False) -> None:
+        """Note the size."""
+        super().__init__()
+        self.z_dim, self.sees_dense_reward = z_dim, sees_dense_reward
+
+    @abstractmethod
+    def encode(self, context: Tensor) -> Tensor:
+        """Encodings [*, n, Z] of context transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""
+
+    def forward(self, context: Tensor) -> Tensor:
+        """Task-specific contexts c^spe = mean_t e(h^t): [*, n, F] -> [*, Z]."""
+        return self.encode(context).mean(dim=-2)
+
+    def told(self, z: Tensor, params: Tensor) -> Tensor:
+        """What the policy is told, [*, Z]: the contexts, unless this is a reference's encoder.
+
+        Args:
+            z: contexts, 0 where there is no transition yet, [*, Z].
+            params: true parameters of their tasks, [*, P], which only a reference may look at.
+        """
+        return z
+
+
+class BlindEncoder(Encoder):
+    """Sees nothing: contexts are 0."""
+
+    def encode(self, context: Tensor) -> Tensor:
+        """Zeros [*, n, Z]."""
+        return context.new_zeros(*context.shape[:-1], self.z_dim)
+
+
+class ContextEncoder(Encoder):
+    """e(h): encodings in (-1, 1)."""
 
     def __init__(
         self,
@@ -70,13 +112,11 @@ class ContextEncoder(nn.Module):
         sees_dense_reward: bool = False,
     ) -> None:
         """Build the network; whether it sees s' follows from the statistics' size."""
-        super().__init__()
-        self.sees_dense_reward = sees_dense_reward
+        super().__init__(z_dim, sees_dense_reward)
         self.obs_dim = obs_dim
         self.standardize = Standardize(*statistics)
         self.in_dim = len(statistics[0])
         self.net = mlp(self.in_dim, hidden, z_dim)
-        self.z_dim = z_dim
 
     def encode(self, context: Tensor) -> Tensor:
         """Encodings [*, n, Z] of context transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""
@@ -87,10 +127,6 @@ class ContextEncoder(nn.Module):
             features = torch.cat([context[..., : -self.obs_dim], change], dim=-1)
         encoded: Tensor = torch.tanh(self.net(self.standardize(features)))
         return encoded
-
-    def forward(self, context: Tensor) -> Tensor:
-        """Task-specific contexts c^spe = mean_t e(h^t): [*, n, F] -> [*, Z]."""
-        return self.encode(context).mean(dim=-2)
 
 
 class ActionSample(NamedTuple):

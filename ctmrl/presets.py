@@ -4,32 +4,42 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 from ctmrl.actor_critic import ActorCriticConfig
 from ctmrl.config import MetaTrainConfig, Preset, RunConfig
 from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
-from meta_envs import ENVIRONMENTS
 
-CODES = {"point_robot": 8, "point_robot_wind": 8, "sparse_point_robot": 4}
-"""Codes of the paper's headline results, by environment."""
-PAPER_CONTEXT_SIZE = {"point_robot": 1024, "point_robot_wind": 256, "sparse_point_robot": 1024}
-# Random actions stay near the origin, where rewards differ little from goal to goal: only a larger
-# encoder on longer contexts learns to tell the goal from them.
-GOAL_TRAINING: dict[str, Any] = {"steps": 12_000, "context_episodes": 3, "context_size": 60}
-GOAL_CONTEXT: dict[str, Any] = {"encoder_hidden": (200, 200, 200), "predictor_hidden": (128, 128)}
-STANDARD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "point_robot": (GOAL_TRAINING, GOAL_CONTEXT),
-    "point_robot_wind": ({}, {}),
-    "sparse_point_robot": (
-        GOAL_TRAINING | {"steps": 6_000},
-        GOAL_CONTEXT | {"squared_errors": True},
-    ),
-}
-"""Where an environment's standard training and context differ from the defaults."""
-PAPER_CONTEXT = {
+Settings = dict[str, Any]
+"""Options by name, where they are not the defaults of their dataclasses."""
+
+
+class Row(NamedTuple):
+    """An environment's presets.
+
+    Attributes:
+        codes: of the paper's headline results, or those of its nearest relative there; fewer than
+            there are training tasks.
+        paper: the field's settings.
+        standard: the default.
+    """
+
+    codes: int
+    paper: Settings
+    standard: Settings
+
+
+PAPER: Settings = {
+    "steps": 65_000,
+    "batch_size": 256,
+    "decay": False,
+    "hidden": (256, 256, 256),
+    "gamma": 0.9,
+    "reward_scale": 100.0,
+    "learning_rate": 3e-4,
+    "target_rate": 0.005,
     "z_dim": 20,
     "encoder_hidden": (200, 200, 200),
     "encoder_lr": 3e-4,
@@ -39,7 +49,102 @@ PAPER_CONTEXT = {
     "cross_prediction_weight": 1.0,
     "contrast_weight": 1.0,
 }
-SMOKE_CONTEXT = {"codes": 3, "z_dim": 4, "encoder_hidden": (16,), "predictor_hidden": (16,)}
+# The field draws a context's transitions from all of a task's data.
+PAPER_GOAL = PAPER | {"context_size": 1024, "context_episodes": 51}
+PAPER_WIND = PAPER | {"context_size": 256, "context_episodes": 10}
+PAPER_ROBOT = PAPER | {
+    "steps": 105_000,
+    # As many as every budget but smoke has of two contexts.
+    "context_episodes": 50,
+    "gamma": 0.99,
+    "reward_scale": 5.0,
+    "timeouts_as_terminals": True,
+    "behavior_regularization": True,
+    "divergence_wind_up": True,
+    # 600 steps as in the field's code, half of them random and no fewer.
+    "random_episodes": 2,
+    "policy_episodes": 1,
+}
+PAPER_CHEETAH = PAPER_ROBOT | {"context_size": 100, "next_obs_in_context": False}
+# A random hopper or walker is down after 9 steps.
+PAPER_LEGS = PAPER_ROBOT | {
+    "context_size": 256,
+    "divergence_maximum": 10_000.0,
+    "random_episodes": 30,
+}
+PAPER_HUMANOID = PAPER_ROBOT | {
+    "context_size": 256,
+    "divergence_initial": 500.0,
+    "next_obs_in_context": False,
+}
+PAPER_ANT = PAPER_HUMANOID | {
+    "steps": 210_000,
+    "meta_batch": 10,
+    "context_size": 512,
+    "policy_episodes": 2,
+}
+
+# Random actions stay near the origin, where rewards differ little from goal to goal: only a larger
+# encoder on longer contexts learns to tell the goal from them.
+GOAL: Settings = {
+    "steps": 12_000,
+    "context_episodes": 3,
+    "context_size": 60,
+    "encoder_hidden": (200, 200, 200),
+    "predictor_hidden": (128, 128),
+}
+SQUARED: Settings = {"squared_errors": True}
+# Sized for a small machine, not searched yet.
+ROBOT: Settings = {
+    "steps": 10_000,
+    "batch_size": 64,
+    "context_size": 128,
+    "encoder_hidden": (128, 128),
+    "predictor_hidden": (128, 128),
+    "hidden": (256, 256),
+    "gamma": 0.99,
+    "reward_scale": 5.0,
+    "learning_rate": 5e-4,
+    "target_rate": 0.005,
+    "behavior_regularization": True,
+    "random_episodes": 2,
+    "policy_episodes": 2,
+}
+LEGS = ROBOT | {"random_episodes": 10}
+
+SMOKE: Settings = {
+    "steps": 60,
+    "meta_batch": 5,
+    "batch_size": 7,
+    "context_size": 11,
+    "context_episodes": 1,
+    "hidden": (16,),
+    "codes": 3,
+    "z_dim": 4,
+    "encoder_hidden": (16,),
+    "predictor_hidden": (16,),
+    "random_episodes": 2,
+    "policy_episodes": 2,
+    "repetitions": 1,
+}
+"""What every environment's smoke preset has on top of its standard one."""
+
+ROWS: dict[str, Row] = {
+    "point_robot": Row(8, PAPER_GOAL, GOAL),
+    "point_robot_wind": Row(8, PAPER_WIND, {}),
+    "sparse_point_robot": Row(4, PAPER_GOAL | SQUARED, GOAL | SQUARED | {"steps": 6_000}),
+    "half_cheetah_vel": Row(16, PAPER_CHEETAH, ROBOT),
+    "hopper_params": Row(16, PAPER_LEGS, LEGS),
+    "walker_params": Row(4, PAPER_LEGS | {"z_dim": 40}, LEGS),
+    "ant_goal": Row(2, PAPER_ANT, ROBOT),
+    "half_cheetah_dir": Row(1, PAPER_CHEETAH, ROBOT),
+    "ant_dir": Row(2, PAPER_ANT, ROBOT),
+    "humanoid_dir": Row(2, PAPER_HUMANOID, ROBOT),
+    "hopper_mass": Row(16, PAPER_LEGS, LEGS),
+    "hopper_friction": Row(16, PAPER_LEGS, LEGS),
+    "walker_mass": Row(4, PAPER_LEGS | {"z_dim": 40}, LEGS),
+    "walker_friction": Row(4, PAPER_LEGS | {"z_dim": 40}, LEGS),
+}
 
 
 def known_preset(name: str) -> Preset:
@@ -67,51 +172,27 @@ def preset(env: str, method: str, name: Preset, **changes: Any) -> RunConfig:
     Raises:
         UsageError: no preset for that environment.
     """
-    if env not in CODES:
-        raise UsageError(f"no preset for '{env}' (there are: {', '.join(CODES)})")
-    standard_training, standard_context = STANDARD[env]
-    training = MetaTrainConfig(**standard_training)
-    actor_critic, meta_test = ActorCriticConfig(), MetaTestConfig()
-    context: dict[str, Any] = {"codes": CODES[env], **standard_context}
-    if name == "paper":
-        context |= PAPER_CONTEXT
-        size = PAPER_CONTEXT_SIZE[env]
-        # The field draws a context's transitions from all of a task's data.
-        episodes = size // ENVIRONMENTS[env].horizon
-        training = MetaTrainConfig(
-            steps=65_000,
-            batch_size=256,
-            context_episodes=episodes,
-            context_size=size,
-            decay=False,
-        )
-        actor_critic = ActorCriticConfig(
-            hidden=(256, 256, 256),
-            gamma=0.9,
-            reward_scale=100.0,
-            learning_rate=3e-4,
-            target_rate=0.005,
-        )
-    elif name == "smoke":
-        context |= SMOKE_CONTEXT
-        training = MetaTrainConfig(
-            steps=60, meta_batch=5, batch_size=7, context_size=11, context_episodes=1
-        )
-        actor_critic = ActorCriticConfig(hidden=(16,))
-        meta_test = MetaTestConfig(random_episodes=2, policy_episodes=2, repetitions=1)
-    config_class = METHODS[method].config
-    known = {field.name for field in dataclasses.fields(config_class)}
-    wanted = {key: value for key, value in context.items() if key in known}
+    if env not in ROWS:
+        raise UsageError(f"no preset for '{env}' (there are: {', '.join(ROWS)})")
+    codes, paper, standard = ROWS[env]
+    chosen = {"paper": paper, "standard": standard, "smoke": standard | SMOKE}[name]
+    chosen = chosen | {"codes": min(codes, chosen.get("codes", codes))}
     return RunConfig(
-        training,
-        actor_critic,
-        config_class(**wanted),
-        meta_test,
+        _with(MetaTrainConfig, chosen),
+        _with(ActorCriticConfig, chosen),
+        _with(METHODS[method].config, chosen),
+        _with(MetaTestConfig, chosen),
         env=env,
         method=method,
         preset=name,
         **changes,
     )
+
+
+def _with(config: type[Any], settings: Settings) -> Any:
+    """A config with those of the settings that it has."""
+    names = {field.name for field in dataclasses.fields(config)}
+    return config(**{key: value for key, value in settings.items() if key in names})
 
 
 def config_from_settings(stored: dict[str, Any], path: Path) -> RunConfig:

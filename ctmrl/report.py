@@ -17,7 +17,15 @@ import tyro
 from numpy.typing import NDArray
 from rich.table import Table
 
-from ctmrl.summary import Result, collate, find_records, interquartile_mean, interval, to_csv
+from ctmrl.summary import (
+    Result,
+    collate,
+    find_records,
+    interquartile_mean,
+    interval,
+    titled,
+    to_csv,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,7 +69,8 @@ def result_table(record: dict[str, Any]) -> Table:
         count = len(group["tasks"])
         table.add_column(f"{TITLES[name]} ({count})\nreturn", justify="right")
         table.add_column("\nscore", justify="right")
-    rows = {record["method"]: [g["return"] for g in groups.values()]}
+    own = titled(record["method"], record.get("note", ""))
+    rows = {own: [g["return"] for g in groups.values()]}
     for key, label in LABELS.items():
         values = [group["references"].get(key) for group in groups.values()]
         if any(value is not None for value in values):
@@ -211,13 +220,13 @@ def summary_table(env: str, group: str, results: list[Result]) -> Table:
     for result in results:
         low, high = interval(result.returns)
         table.add_row(
-            result.method,
+            result.title,
             f"{result.returns.mean():.3f}",
             f"{low:.3f} to {high:.3f}" if len(result.seeds) > 1 else "-",
             f"{interquartile_mean(result.returns):.3f}",
             f"{result.scores.mean():.1f}",
             " ".join(map(str, result.seeds)),
-            style="bold",
+            style="" if result.note else "bold",
         )
     references = results[0].references
     for key, label in LABELS.items():

@@ -30,6 +30,7 @@ class Result:
         returns: each seed's mean return.
         scores: each seed's normalised score, NaN where there is none.
         references: mean returns of the references on the same tasks.
+        note: what a reader must know of the method, if anything.
     """
 
     env: str
@@ -39,6 +40,17 @@ class Result:
     returns: NDArray[np.float64]
     scores: NDArray[np.float64]
     references: dict[str, float]
+    note: str = ""
+
+    @property
+    def title(self) -> str:
+        """The method as a table names it."""
+        return titled(self.method, self.note)
+
+
+def titled(method: str, note: str) -> str:
+    """A method's name with what a reader must know of it: `oracle_task (reference, ...)`."""
+    return f"{method} ({note})" if note else method
 
 
 def find_records(paths: list[Path]) -> list[dict[str, Any]]:
@@ -108,6 +120,7 @@ def collate(records: list[dict[str, Any]]) -> list[Result]:
                 np.array([one["return"] for one in groups], dtype=np.float64),
                 np.array([one["score"] for one in groups], dtype=np.float64),
                 groups[0]["references"],
+                members[0].get("note", ""),
             )
         )
     return results

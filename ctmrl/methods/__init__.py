@@ -8,6 +8,8 @@ from ctmrl.methods.base import Method, MethodConfig
 from ctmrl.methods.ctmrl import CTMRL, CTMRLConfig
 from ctmrl.methods.ctmrl_released import CTMRLReleased, CTMRLReleasedConfig
 from ctmrl.methods.focal import FOCAL, FOCALConfig
+from ctmrl.methods.no_context import NoContext, NoContextConfig
+from ctmrl.methods.oracle_task import OracleTask, OracleTaskConfig
 
 
 class Row(NamedTuple):
@@ -24,4 +26,6 @@ METHODS: dict[str, Row] = {
         CTMRLReleased, CTMRLReleasedConfig, "CTMRL as the source paper's published code has it"
     ),
     "focal": Row(FOCAL, FOCALConfig, "distance metric between contexts (Li et al. 2021)"),
+    "oracle_task": Row(OracleTask, OracleTaskConfig, "reference: given the true task"),
+    "no_context": Row(NoContext, NoContextConfig, "reference: contexts are 0"),
 }

@@ -5,12 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from ctmrl.networks import ContextEncoder, Statistics
+from ctmrl.networks import ContextEncoder, Encoder, Statistics
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,20 @@ class Method(nn.Module, ABC):
 
     context_sets = 1
     """Contexts from different episodes each step needs of a task."""
+    note: ClassVar[str] = ""
+    """What stands behind the method's name in every table, where a reader must know it."""
 
     def __init__(self, config: MethodConfig, statistics: Statistics, dims: Dimensions) -> None:
         """Build the encoder; initial weights come from torch's global generator."""
         super().__init__()
         self.dims = dims
-        self.encoder = ContextEncoder(
+        self.encoder = self.build_encoder(config, statistics)
+
+    def build_encoder(self, config: MethodConfig, statistics: Statistics) -> Encoder:
+        """What makes contexts; its `z_dim` is the size of all contexts."""
+        return ContextEncoder(
             statistics.context,
-            dims.obs,
+            self.dims.obs,
             config.encoder_hidden,
             config.z_dim,
             config.dense_reward_in_context,
@@ -94,3 +100,17 @@ class Method(nn.Module, ABC):
     def code_of(self, z: Tensor) -> Tensor | None:
         """Code of each context [*, Z], int64 [*]; None where a method has no codes."""
         return None
+
+
+class Reference(Method):
+    """A line to read methods against: it learns no contexts, and `note` says so in every table."""
+
+    @abstractmethod
+    def build_encoder(self, config: MethodConfig, statistics: Statistics) -> Encoder:
+        """What stands in for contexts, without parameters to train."""
+
+    def context_loss(
+        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """0, for there is nothing to train."""
+        return torch.zeros(()), {}

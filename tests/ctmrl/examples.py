@@ -25,8 +25,8 @@ from datagen.dataset import COLUMNS, Dataset, TaskData, task_file, write_index, 
 from meta_envs import MetaVectorEnv
 from tests.datagen.examples import index_of, task_data
 
-OBS, ACT, Z, CODES, TASKS, BATCH, LENGTH = 3, 2, 7, 5, 17, 11, 13
-"""O, A, Z, N, training tasks, B and T wherever a test does not need others."""
+OBS, ACT, Z, CODES, TASKS, BATCH, LENGTH, PARAMS = 3, 2, 7, 5, 17, 11, 13, 31
+"""O, A, Z, N, training tasks, B, T and P wherever a test does not need others."""
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -42,7 +42,7 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 def statistics(next_obs: bool = True, seed: int = 0) -> Statistics:
     """Statistics that are neither 0 nor 1 anywhere."""
     draw = generator(seed)
-    sizes = (OBS, OBS + ACT + 1 + OBS * next_obs, 1 + OBS)
+    sizes = (OBS, OBS + ACT + 1 + OBS * next_obs, 1 + OBS, PARAMS)
     return Statistics(
         *(
             (torch.randn(size, generator=draw), 0.5 + torch.rand(size, generator=draw))
@@ -118,13 +118,12 @@ def hand_made(lengths: Mapping[int, Sequence[int]]) -> HandMade:
     """Episodes of these lengths for each task; a row's observation is (task, episode, step).
 
     Odd episodes end in a terminal, even ones in a timeout. The rewards are 1000 task + 10 episode
-    + step / 10, the dense rewards minus that.
+    + step / 10, the dense rewards minus that. A task's parameters are (task, -task).
     """
     tables = {task: _table(task, episodes) for task, episodes in lengths.items()}
-    tasks = np.array(list(lengths), dtype=np.int64)
-    return HandMade(
-        Path("nowhere"), {}, "none", tasks, tasks, tasks[:0], np.zeros((len(tasks), 2)), tables
-    )
+    tasks = np.array(sorted(lengths), dtype=np.int64)
+    params = np.stack([tasks, -tasks], axis=1).astype(np.float64)
+    return HandMade(Path("nowhere"), {}, "none", tasks, tasks, tasks[:0], params, tables)
 
 
 def _table(task: int, episodes: Sequence[int]) -> TaskData:

@@ -13,7 +13,7 @@ from ctmrl.errors import UsageError
 from ctmrl.meta_train import Learner
 from ctmrl.methods import METHODS
 from ctmrl.presets import preset
-from tests.ctmrl.examples import ACT, OBS, dimensions, normal, smoke, statistics
+from tests.ctmrl.examples import ACT, OBS, PARAMS, dimensions, normal, smoke, statistics
 
 
 @pytest.mark.parametrize("next_obs", [True, False])
@@ -33,7 +33,7 @@ def test_an_agent_is_the_learners(method: str, next_obs: bool, wind_data: Offlin
         theirs = wanted.state_dict()
         assert found.state_dict().keys() == theirs.keys()
         assert all(value.equal(theirs[key]) for key, value in found.state_dict().items())
-    obs, z = normal(5, 2).float(), normal(5, config.context.z_dim).float()
+    obs, z = normal(5, 2).float(), normal(5, agent.method.encoder.z_dim).float()
     assert agent.actor.act(obs, z).equal(learner.actor_critic.actor.act(obs, z))
 
 
@@ -57,7 +57,7 @@ def test_settings_that_do_not_fit_the_tasks() -> None:
 
 @pytest.mark.parametrize("next_obs", [True, False])
 def test_empty_statistics_have_the_sizes_of_real_ones(next_obs: bool) -> None:
-    empty, real = empty_statistics(dimensions(), next_obs), statistics(next_obs)
+    empty, real = empty_statistics(dimensions(), next_obs, PARAMS), statistics(next_obs)
     for (mean, std), (wanted, _) in zip(empty, real, strict=True):
         assert mean.shape == std.shape == wanted.shape
         assert mean.equal(torch.zeros_like(wanted))

@@ -14,6 +14,7 @@ from torch import Tensor
 from ctmrl.data import OfflineData
 from ctmrl.errors import UsageError
 from datagen.dataset import DatasetError, open_dataset, task_file
+from meta_envs import task_set
 from tests.ctmrl.examples import ACT, OBS, generator, open_hand_made
 from tests.datagen.examples import graded_data, write_tasks
 
@@ -39,6 +40,11 @@ def test_the_table_counts_tasks_and_episodes(data: OfflineData) -> None:
     assert (data.obs_dim, data.act_dim) == (OBS, ACT)
     assert data.table.dtype == torch.float32
     assert len(data.table) == 34 + 7 * 17 + 12
+
+
+def test_each_task_has_its_own_parameters(data: OfflineData) -> None:
+    assert data.params.tolist() == [[7, -7], [2, -2], [5, -5]]
+    assert data.params.dtype == torch.float32
 
 
 def test_a_batch_is_of_the_right_tasks_in_order(data: OfflineData) -> None:
@@ -153,7 +159,8 @@ def test_statistics_against_numpy(wind_path: Path, next_obs: bool) -> None:
     )
     change = after - obs
     seen = [obs, action, reward[:, None]] + [change] * next_obs
-    wanted = obs, np.hstack(seen), np.hstack([reward[:, None], change])
+    params = task_set("point_robot_wind").params[dataset.train_tasks]
+    wanted = obs, np.hstack(seen), np.hstack([reward[:, None], change]), params
     found = OfflineData(dataset, dataset.train_tasks).statistics(next_obs)
     for (mean, std), values in zip(found, wanted, strict=True):
         np.testing.assert_allclose(mean, values.mean(axis=0), atol=1e-5)

@@ -18,6 +18,7 @@ from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig, meta_test
 from ctmrl.meta_train import LAST_RATE, Learner, meta_train
 from ctmrl.methods import METHODS
+from ctmrl.methods.base import Reference
 from ctmrl.presets import preset
 from datagen.dataset import open_dataset
 from meta_envs import reference_returns, task_set
@@ -40,7 +41,7 @@ def config_of(method: str = "ctmrl", brac: bool = False, **training: Any) -> Run
     )
 
 
-@pytest.fixture(params=[("ctmrl", False), ("ctmrl", True), ("focal", True)], ids=str)
+@pytest.fixture(params=[("ctmrl", False), *((method, True) for method in METHODS)], ids=str)
 def config(request: pytest.FixtureRequest) -> RunConfig:
     return config_of(*request.param)
 
@@ -118,6 +119,8 @@ def test_the_actor_critic_never_trains_the_encoder_nor_the_method_the_actor_crit
     learner.update()
     named = dict(modules(learner).named_parameters())
     trained = {name: p for name, p in named.items() if p.requires_grad}
+    if isinstance(method, Reference):
+        assert not losses.pop("method").requires_grad
     for owner, loss in losses.items():
         gradients = torch.autograd.grad(loss, list(trained.values()), allow_unused=True)
         reached = {

@@ -12,7 +12,7 @@ from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 from torch.nn import functional
 
-from ctmrl.networks import Actor, ContextEncoder, Critic, Predictors, Standardize, mlp
+from ctmrl.networks import Actor, BlindEncoder, ContextEncoder, Critic, Predictors, Standardize, mlp
 from tests.ctmrl.examples import ACT, BATCH, LENGTH, OBS, Z, contexts, generator, normal, statistics
 
 HIDDEN = (23, 19)
@@ -82,6 +82,12 @@ def test_encodings_are_between_minus_1_and_1() -> None:
     encoded = encoder.encode(1e6 * contexts())
     assert encoded.abs().max() <= 1.0
     assert encoded.isfinite().all()
+
+
+def test_a_blind_encoder_gives_0_for_everything() -> None:
+    encoder, h = BlindEncoder(Z), torch.full_like(contexts(), torch.nan)
+    assert encoder.encode(h).equal(torch.zeros(2, BATCH, LENGTH, Z))
+    assert encoder(h).equal(torch.zeros(2, BATCH, Z))
 
 
 def actor() -> Actor:

@@ -9,22 +9,26 @@ from typing import Any, get_args
 
 import pytest
 
+from ctmrl.actor_critic import ActorCriticConfig
 from ctmrl.agent import build_method, empty_statistics
-from ctmrl.config import Preset, RunConfig
+from ctmrl.config import MetaTrainConfig, Preset, RunConfig, check_settings
 from ctmrl.errors import UsageError
+from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
 from ctmrl.methods.base import Dimensions
 from ctmrl.methods.ctmrl import CTMRLConfig
-from ctmrl.presets import config_from_settings, known_preset, preset
+from ctmrl.presets import ROWS, SMOKE, config_from_settings, known_preset, preset
 from ctmrl.runs import to_json
-from meta_envs import task_set
+from datagen.budgets import budget
+from meta_envs import ENVIRONMENTS, task_set
 from tests.meta_envs.robots import POINT_ROBOTS
 
 NAMES = get_args(Preset)
+ROBOTS_OF_THE_PAPER = ("half_cheetah_vel", "hopper_params", "walker_params", "ant_goal")
 PATH = Path("run") / "config.json"
 
 
-@pytest.fixture(params=[(e, m, n) for e in POINT_ROBOTS for m in METHODS for n in NAMES], ids=str)
+@pytest.fixture(params=[(e, m, n) for e in ROWS for m in METHODS for n in NAMES], ids=str)
 def config(request: pytest.FixtureRequest) -> RunConfig:
     """Every preset in turn."""
     return preset(*request.param)
@@ -43,9 +47,12 @@ def through_a_file(config: RunConfig) -> dict[str, Any]:
 def test_it_builds(config: RunConfig) -> None:
     tasks = task_set(config.env)
     dims = Dimensions(2, 2, len(tasks.train_tasks), config.training.steps)
-    statistics = empty_statistics(dims, config.context.next_obs_in_context)
+    params = len(tasks.param_names)
+    statistics = empty_statistics(dims, config.context.next_obs_in_context, params)
     method = build_method(config, statistics, dims)
-    assert method.encoder.z_dim == config.context.z_dim
+    check_settings(config)
+    sizes = {"oracle_task": params}
+    assert method.encoder.z_dim == sizes.get(config.method, config.context.z_dim)
     assert isinstance(method, METHODS[config.method].method)
     assert type(config.context) is METHODS[config.method].config
 
@@ -78,6 +85,49 @@ def test_the_papers_sizes() -> None:
     assert sizes == {"point_robot": 1024, "point_robot_wind": 256, "sparse_point_robot": 1024}
 
 
+def test_the_fields_settings_for_robots() -> None:
+    found = {}
+    for env in ROBOTS_OF_THE_PAPER:
+        config = preset(env, "ctmrl", "paper")
+        assert isinstance(config.context, CTMRLConfig)
+        actor_critic, training, context = config.actor_critic, config.training, config.context
+        assert (actor_critic.gamma, actor_critic.reward_scale) == (0.99, 5.0)
+        assert (actor_critic.behavior_regularization, actor_critic.dual_penalty) == (True, "value")
+        assert actor_critic.divergence_wind_up
+        assert actor_critic.timeouts_as_terminals
+        assert (actor_critic.hidden, actor_critic.learning_rate) == ((256, 256, 256), 3e-4)
+        found[env] = (
+            context.codes, context.z_dim, context.next_obs_in_context,
+            training.steps, training.meta_batch, training.context_size,
+            actor_critic.divergence_initial, actor_critic.divergence_maximum,
+        )  # fmt: skip
+    # Table 3 of the paper, and the configurations of the field's code.
+    assert found == {
+        "half_cheetah_vel": (16, 20, False, 105_000, 16, 100, 50, 2_000),
+        "hopper_params": (16, 20, True, 105_000, 16, 256, 50, 10_000),
+        "walker_params": (4, 40, True, 105_000, 16, 256, 50, 10_000),
+        "ant_goal": (2, 20, False, 210_000, 10, 512, 500, 2_000),
+    }
+
+
+def test_the_data_of_the_same_budget_are_enough(config: RunConfig) -> None:
+    episodes = budget(config.env, config.preset).total_episodes
+    assert METHODS[config.method].method.context_sets * config.training.context_episodes <= episodes
+
+
+def test_every_environment_has_presets() -> None:
+    assert list(ROWS) == list(ENVIRONMENTS)
+
+
+def test_every_setting_of_a_row_is_an_option_of_some_method() -> None:
+    parts: list[Any] = [MetaTrainConfig, ActorCriticConfig, MetaTestConfig]
+    parts += [row.config for row in METHODS.values()]
+    known = {field.name for part in parts for field in dataclasses.fields(part)}
+    for row in ROWS.values():
+        for settings in (row.paper, row.standard, SMOKE):
+            assert settings.keys() <= known
+
+
 def test_changes_are_made() -> None:
     config = preset("point_robot", "focal", "smoke", seed=11, threads=3)
     assert (config.env, config.method, config.preset) == ("point_robot", "focal", "smoke")
@@ -88,8 +138,10 @@ def test_an_unknown_preset_or_environment_is_one_sentence() -> None:
     assert [known_preset(name) for name in NAMES] == list(NAMES)
     with pytest.raises(UsageError, match=r"^no preset 'huge' \(known: standard, paper, smoke\)$"):
         known_preset("huge")
-    with pytest.raises(UsageError, match=r"^no preset for 'ant_goal' \(there are: point_robot, "):
-        preset("ant_goal", "ctmrl", "smoke")
+    with pytest.raises(
+        UsageError, match=r"^no preset for 'noisy_robot' \(there are: point_robot, "
+    ):
+        preset("noisy_robot", "ctmrl", "smoke")
 
 
 @pytest.mark.parametrize(

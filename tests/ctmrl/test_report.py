@@ -216,6 +216,17 @@ def test_the_summary_table() -> None:
     assert cells(summary_table("point_robot_wind", "seen", single))["ctmrl"][1] == "-"
 
 
+def test_a_reference_is_called_one_in_every_table() -> None:
+    made = record("oracle_task") | {"note": "reference, given the true task"}
+    title = "oracle_task (reference, given the true task)"
+    results = collate([{**made, "run": "seed-0"}, {**record(), "run": "seed-1"}])
+    rows = [result for result in results if result.group == "unseen"]
+    for table in (result_table(made), summary_table("point_robot_wind", "unseen", rows)):
+        assert title in cells(table)
+        assert "oracle_task" not in cells(table)
+    assert "ctmrl" in cells(summary_table("point_robot_wind", "unseen", rows))
+
+
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_records(tmp_path / "runs")
     table = tmp_path / "new" / "table.csv"

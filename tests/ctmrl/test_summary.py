@@ -12,8 +12,20 @@ import numpy as np
 import pytest
 
 from ctmrl.errors import UsageError
-from ctmrl.summary import collate, find_records, interquartile_mean, interval, to_csv
+from ctmrl.summary import (
+    collate,
+    find_records,
+    interquartile_mean,
+    interval,
+    titled,
+    to_csv,
+)
 from tests.ctmrl.examples import record
+
+
+def test_a_note_stands_behind_the_methods_name() -> None:
+    assert titled("focal", "") == "focal"
+    assert titled("no_context", "reference") == "no_context (reference)"
 
 
 def of_run(name: str = "", **changes: Any) -> dict[str, Any]:

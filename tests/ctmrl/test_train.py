@@ -24,9 +24,13 @@ from rich.console import Console
 
 from ctmrl.config import RunConfig
 from ctmrl.errors import UsageError
+from ctmrl.evaluate import EvaluateConfig
+from ctmrl.evaluate import main as evaluate
+from ctmrl.meta_train import Learner
+from ctmrl.methods import METHODS
 from ctmrl.presets import config_from_settings, preset
 from ctmrl.runs import load_checkpoint, read_json
-from ctmrl.train import best_behavior, default_folder, split_tasks, train
+from ctmrl.train import best_behavior, default_folder, parse, split_tasks, train
 from datagen.dataset import open_dataset, task_file
 from meta_envs import task_set
 from tests.ctmrl.commands import FILES, Commands, contents, rows, wait_until
@@ -303,6 +307,31 @@ def test_a_method_without_codes_and_a_sparse_reward(sparse_run: SparseRun) -> No
     assert sparse_run.record["groups"]["seen"]["return"] == 0.0
     assert sparse_run.record["groups"]["seen"]["codes"] is None
     assert metrics(sparse_run.path)[-1]["return/training_tasks"] == "0.0"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_trains_goes_on_and_is_evaluated_again(
+    method: str, wind_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ["--preset", "smoke", "--steps", "6", "--method", method, "--data", str(wind_path)]
+    config = parse([*command, "--policy-episodes", "1", "--random-episodes", "1"])
+    whole, _ = run(config, out=tmp_path / "whole")
+    assert whole["method"] == method
+    update = Learner.update
+
+    def interrupted(learner: Learner) -> dict[str, torch.Tensor]:
+        if learner.step == 4:
+            raise KeyboardInterrupt
+        return update(learner)
+
+    monkeypatch.setattr(Learner, "update", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(config, out=tmp_path / "parts")
+    monkeypatch.setattr(Learner, "update", update)
+    run(config, out=tmp_path / "parts")
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+    evaluate(EvaluateConfig(tmp_path / "whole", out=tmp_path / "again"))
+    assert read_json(tmp_path / "again" / "evaluation.json") == whole
 
 
 def test_tensorboard_events(sparse_run: SparseRun) -> None:

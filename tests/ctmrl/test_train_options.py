@@ -121,6 +121,19 @@ def test_wrong_data_is_one_sentence(
     assert not (tmp_path / "out").exists()
 
 
+def test_an_environment_without_a_dataset_says_how_to_collect_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train", "--env", "HalfCheetahVel-v0"])
+    assert run_command(command.main) == 2
+    assert capsys.readouterr().err == (
+        "error: datasets/half_cheetah_vel: no dataset is there; run `python -m datagen.collect "
+        "--env half_cheetah_vel --out datasets/half_cheetah_vel`, or give another folder\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_of_something_else_is_left_alone(mistake: Any, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("x")

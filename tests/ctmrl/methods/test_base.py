@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from ctmrl.methods import METHODS
-from ctmrl.methods.base import Method
+from ctmrl.methods.base import Method, Reference
+from ctmrl.networks import ContextEncoder
 from tests.ctmrl.examples import (
     ACT,
     BATCH,
     OBS,
+    PARAMS,
     TASKS,
     Z,
     contexts,
@@ -41,6 +43,10 @@ def loss_at_the_end(method: Method) -> tuple[torch.Tensor, dict[str, torch.Tenso
     return method.context_loss(h, method.encoder(h), generator())
 
 
+LEARNT = [name for name, row in METHODS.items() if not issubclass(row.method, Reference)]
+REFERENCES = [name for name in METHODS if name not in LEARNT]
+
+
 @pytest.fixture(params=METHODS)
 def name(request: pytest.FixtureRequest) -> str:
     found: str = request.param
@@ -56,8 +62,10 @@ def test_the_table_names_each_method_with_its_own_config() -> None:
 
 
 @pytest.mark.parametrize("next_obs", [True, False])
+@pytest.mark.parametrize("name", LEARNT)
 def test_a_loss_trains_every_parameter_of_the_encoder(name: str, next_obs: bool) -> None:
     method = build(name, next_obs)
+    assert isinstance(method.encoder, ContextEncoder)
     assert method.encoder.in_dim == OBS + ACT + 1 + OBS * next_obs
     loss, _ = loss_at_the_end(method)
     assert loss.shape == ()
@@ -94,3 +102,20 @@ def test_the_codes_of_contexts(name: str) -> None:
     if found is not None:
         assert found.dtype == torch.int64
         assert found.shape == (BATCH,)
+
+
+@pytest.mark.parametrize("name", LEARNT)
+def test_no_method_sees_a_tasks_parameters(name: str) -> None:
+    method, z = build(name), normal(BATCH, Z).float()
+    assert method.encoder.told(z, torch.full((BATCH, PARAMS), torch.nan)) is z
+    assert not method.note
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_a_reference_has_nothing_to_train_and_says_what_it_is(name: str) -> None:
+    method = build(name)
+    assert not list(method.parameters())
+    loss, metrics = loss_at_the_end(method)
+    assert (loss.item(), loss.requires_grad, metrics) == (0.0, False, {})
+    assert method.note.startswith("reference, ")
+    assert METHODS[name].summary.startswith("reference: ")
