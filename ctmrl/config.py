@@ -74,6 +74,10 @@ class RunConfig:
     """Throw away what the run folder holds and begin anew."""
     threads: int = 1
     """Threads of the numerical libraries; part of what makes a run repeatable."""
+    memory: float | None = None
+    """GB of memory the training data may take as a table; default half of what is available. A
+    larger table is read from a file beside the run, which ends with the process and changes no
+    result; 0 always does that."""
     tensorboard: bool = False
     """Also write TensorBoard events (needs the extra: pip install 'ctmrl[tensorboard]')."""
 
@@ -100,6 +104,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "code_decay": _SHARE,
     "data_episodes": (1, math.inf),
     "meta_batch": (2, math.inf),
+    "memory": (0, math.inf),
     "seed": (0, 2**63 - 1),
 }
 """Least and largest value of the options that have them."""

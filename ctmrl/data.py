@@ -1,8 +1,10 @@
-"""The training tasks' offline data as one table in memory, sampled by one gather."""
+"""The training tasks' offline data as one table, sampled by one gather."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +14,7 @@ from torch import Tensor
 
 from ctmrl.errors import UsageError
 from ctmrl.networks import Statistics
+from ctmrl.table import Room
 from datagen.dataset import Dataset, TaskData
 
 
@@ -41,20 +44,32 @@ class _Layout:
     act_dim: int
 
     @property
-    def context(self) -> slice:
-        return slice(0, 2 * self.obs_dim + self.act_dim + 1)
+    def reward(self) -> int:
+        return self.obs_dim + self.act_dim
+
+    @property
+    def context(self) -> int:
+        """Where the part for contexts ends."""
+        return self.reward + 1 + self.obs_dim
+
+    @property
+    def width(self) -> int:
+        return self.context + 2
 
 
 class OfflineData:
     """Transitions of T tasks in one float32 table: (s, a, r, s') for contexts, then (r, terminal).
 
-    Tasks are counted 0..T-1 here, in the order they were given.
+    Tasks are counted 0..T-1 here, in the order they were given, and their rows follow each other in
+    that order: [T, row, feature] for tasks of any lengths. The table is the only copy, filled a
+    block of rows at a time.
 
     Attributes:
         tasks: int64 [T], the tasks' rows in the environment's task set.
         obs_dim: O.
         act_dim: A.
         params: float32 [T, P], the tasks' true parameters, which no method but a reference sees.
+        table: [N, 2 O + A + 3].
     """
 
     def __init__(
@@ -63,6 +78,7 @@ class OfflineData:
         tasks: NDArray[np.int64],
         timeouts_as_terminals: bool = False,
         dense_context: bool = False,
+        room: Room | None = None,
     ) -> None:
         """Read the tasks.
 
@@ -71,29 +87,52 @@ class OfflineData:
             tasks: rows of the task set; nothing of other tasks is read.
             timeouts_as_terminals: treat the time limit as a real end, the field's habit.
             dense_context: on a sparse environment, let contexts see the dense reward.
+            room: where the table may lie.
 
         Raises:
             DatasetError: a file is damaged, or a task has nothing in the slice.
+            UsageError: there is no room for the table.
         """
         self.tasks = np.asarray(tasks, dtype=np.int64)
         self._part = dataset.part
-        rows = np.searchsorted(dataset.tasks, self.tasks)
-        self.params = torch.tensor(dataset.params[rows], dtype=torch.float32)
-        tables, lengths = [], []
-        for task in tasks:
-            # One task's columns at a time: of the others there are only rows of the table.
-            data = dataset.read(int(task))
-            self.obs_dim, self.act_dim = data.observations.shape[1], data.actions.shape[1]
-            tables.append(_rows(data, timeouts_as_terminals, dense_context))
-            lengths.append(np.bincount(data.episode))
-        self._layout = _Layout(self.obs_dim, self.act_dim)
-        self.table = torch.from_numpy(np.concatenate(tables))
-        self._task_rows = torch.tensor([len(rows) for rows in tables])
+        at = np.searchsorted(dataset.tasks, self.tasks)
+        self.params = torch.tensor(dataset.params[at], dtype=torch.float32)
+        lengths = [dataset.episodes(int(task)).lengths for task in tasks]
+        self._task_rows = torch.tensor([int(rows.sum()) for rows in lengths])
         self._task_start = torch.cumsum(self._task_rows, 0) - self._task_rows
-        self._task_episodes = torch.tensor([len(counts) for counts in lengths])
+        self._task_episodes = torch.tensor([len(rows) for rows in lengths])
         self._task_first_episode = torch.cumsum(self._task_episodes, 0) - self._task_episodes
         self._episode_rows = torch.from_numpy(np.concatenate(lengths))
         self._episode_start = torch.cumsum(self._episode_rows, 0) - self._episode_rows
+        first = next(dataset.blocks(int(tasks[0]), rows=1))
+        self.obs_dim, self.act_dim = first.observations.shape[1], first.actions.shape[1]
+        self._layout = _Layout(self.obs_dim, self.act_dim)
+        self._table = (room or Room()).table(int(self._task_rows.sum()), self._layout.width)
+        self.table = self._table.values
+        rows_of = partial(
+            _rows, timeouts_as_terminals=timeouts_as_terminals, dense_context=dense_context
+        )
+        # Twice, because the statistics are of the changes s' - s: so they need no second table.
+        self._fill(dataset, lambda data: _with_changes(rows_of(data), self._layout))
+        self._statistics = {seen: self._measure(seen) for seen in (False, True)}
+        self._fill(dataset, rows_of)
+        self._table.filled()
+
+    def _fill(self, dataset: Dataset, rows_of: Callable[[TaskData], NDArray[np.float32]]) -> None:
+        start = 0
+        for task in self.tasks:
+            for block in dataset.blocks(int(task)):
+                end = start + len(block)
+                self.table[start:end] = torch.from_numpy(rows_of(block))
+                start = end
+
+    def _measure(self, next_obs_in_context: bool) -> Statistics:
+        """The statistics, while the table has changes in place of next observations."""
+        reward, context = self._layout.reward, self._layout.context
+        seen = context if next_obs_in_context else reward + 1
+        columns = slice(self.obs_dim), slice(seen), slice(reward, context)
+        parts = (*(self.table[:, part] for part in columns), self.params)
+        return Statistics(*((x.mean(dim=0), x.std(dim=0)) for x in parts))
 
     def __len__(self) -> int:
         """Number of tasks T."""
@@ -104,23 +143,28 @@ class OfflineData:
         """Number of episodes of the task that has fewest."""
         return int(self._task_episodes.min())
 
+    @property
+    def in_file(self) -> bool:
+        """Whether the table is in a file instead of in memory."""
+        return self._table.in_file
+
+    def page_in(self, rows: Tensor) -> None:
+        """Begin to read rows of the table from its file, if it is in one; returns at once."""
+        self._table.page_in(rows)
+
     def statistics(self, next_obs_in_context: bool) -> Statistics:
         """Mean and standard deviation of the columns and parameters, over all tasks here."""
-        obs = self.table[:, : self.obs_dim]
-        context = self.table[:, self._layout.context]
-        change = context[:, -self.obs_dim :] - obs
-        before = context[:, : -self.obs_dim]
-        seen = torch.cat([before, change], dim=1) if next_obs_in_context else before
-        target = torch.cat([before[:, -1:], change], dim=1)
-        columns = (obs, seen, target, self.params)
-        return Statistics(*((x.mean(dim=0), x.std(dim=0)) for x in columns))
+        return self._statistics[next_obs_in_context]
 
     def transitions(self, tasks: Tensor, n: int, generator: torch.Generator) -> Transitions:
         """Draw n transitions a task, uniformly with replacement, [B * n, ...]."""
+        return self.unpack(self.table.index_select(0, self.batch_rows(tasks, n, generator)))
+
+    def batch_rows(self, tasks: Tensor, n: int, generator: torch.Generator) -> Tensor:
+        """The rows of the table that `transitions` draws."""
         draw = torch.rand(len(tasks), n, generator=generator)
         offset = (draw * self._task_rows[tasks][:, None]).long()
-        rows = (self._task_start[tasks][:, None] + offset).flatten()
-        return self.unpack(self.table.index_select(0, rows))
+        return (self._task_start[tasks][:, None] + offset).flatten()
 
     def unpack(self, rows: Tensor) -> Transitions:
         """Split table rows [n, F] into a batch."""
@@ -159,6 +203,15 @@ class OfflineData:
         Raises:
             UsageError: a task has fewer than sets * episodes episodes.
         """
+        rows = self.context_rows(tasks, sets, episodes, n, generator)
+        width = self._layout.context
+        gathered = self.table.index_select(0, rows)[:, :width]
+        return gathered.view(sets, len(tasks), n, width)
+
+    def context_rows(
+        self, tasks: Tensor, sets: int, episodes: int, n: int, generator: torch.Generator
+    ) -> Tensor:
+        """The rows of the table that `contexts` draws, [sets * B * n]."""
         self.check_episodes(sets, episodes)
         count = self._task_episodes[tasks]
         keys = torch.rand(len(tasks), int(count.max()), generator=generator)
@@ -173,10 +226,7 @@ class OfflineData:
         which = torch.searchsorted(ends, offset, right=True)
         start = self._episode_start[chosen].view(len(tasks), sets, episodes)
         within = offset - (ends - lengths).gather(2, which)
-        rows = (start.gather(2, which) + within).transpose(0, 1).flatten()
-        width = self._layout.context.stop
-        gathered = self.table.index_select(0, rows)[:, :width]
-        return gathered.view(sets, len(tasks), n, width)
+        return (start.gather(2, which) + within).transpose(0, 1).flatten()
 
 
 def _rows(data: TaskData, timeouts_as_terminals: bool, dense_context: bool) -> NDArray[np.float32]:
@@ -197,3 +247,9 @@ def _rows(data: TaskData, timeouts_as_terminals: bool, dense_context: bool) -> N
         axis=1,
         dtype=np.float32,
     )
+
+
+def _with_changes(rows: NDArray[np.float32], layout: _Layout) -> NDArray[np.float32]:
+    """The same rows with s' - s in place of s'."""
+    rows[:, layout.reward + 1 : layout.context] -= rows[:, : layout.obs_dim]
+    return rows

@@ -82,13 +82,28 @@ class Learner:
             tasks, sets, config.context_episodes, config.context_size, self.generator
         )
 
+    def _draw_tasks(self, generator: torch.Generator) -> Tensor:
+        return torch.randperm(len(self.data), generator=generator)[: self.config.meta_batch]
+
+    def _page_in(self) -> None:
+        """Have the rows of the next step read from the disk, if they are there, during this one.
+
+        They are drawn from a copy of the generator, once nothing else draws in this step. If
+        something does after all, as `before_step` may, other rows are read in vain.
+        """
+        if self.data.in_file:
+            config, ahead = self.config, self.generator.clone_state()
+            tasks, sets = self._draw_tasks(ahead), self.method.context_sets
+            size = (config.context_episodes, config.context_size)
+            self.data.page_in(self.data.context_rows(tasks, sets, *size, ahead))
+            self.data.page_in(self.data.batch_rows(tasks, config.batch_size, ahead))
+
     def update(self) -> dict[str, Tensor]:
         """One gradient step; scalars by metric name."""
         config, method = self.config, self.method
         self._set_rates()
         method.before_step(self.step, self.all_contexts)
-        order = torch.randperm(len(self.data), generator=self.generator)
-        tasks = order[: config.meta_batch]
+        tasks = self._draw_tasks(self.generator)
         contexts = self._draw(tasks, method.context_sets)
         batch = self.data.transitions(tasks, config.batch_size, self.generator)
         z = method.encoder(contexts)
@@ -97,6 +112,7 @@ class Learner:
         given = method.encoder.told(z[0].detach(), self.data.params[tasks])
         repeated = given.repeat_interleave(config.batch_size, dim=0)
         policy_loss, more = self.actor_critic.loss(batch, repeated, self.generator)
+        self._page_in()
         self.optimizers["main"].zero_grad()
         (context_loss + policy_loss).backward()  # type: ignore[no-untyped-call]
         self.optimizers["main"].step()

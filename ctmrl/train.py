@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 LOGS, CHECKPOINTS, RETURNS = 100, 50, 10
 """Rows of metrics, checkpoints, and measured returns on training tasks in a run."""
-NOT_SETTINGS = {"data", "out", "restart", "tensorboard"}
+NOT_SETTINGS = {"data", "out", "restart", "tensorboard", "memory"}
 """Fields of RunConfig that do not change a run's results."""
 PACKAGES = ("ctmrl", "numpy", "torch", "gymnasium", "scikit-learn")
 
@@ -127,20 +127,22 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
     from ctmrl.config import check_settings
     from ctmrl.data import OfflineData
     from ctmrl.meta_train import Learner
+    from ctmrl.table import Room
     from ctmrl.threads import settle_threads
 
     check_settings(config)
     settle_threads(config.threads)
     dataset = open_data(config)
     split = split_tasks(dataset, config.validate)
+    path = config.out or default_folder(config)
     data = OfflineData(
         dataset,
         split.train,
         config.actor_critic.timeouts_as_terminals,
         config.context.dense_reward_in_context,
+        Room(config.memory, path),
     )
     learner = Learner(config, data)
-    path = config.out or default_folder(config)
     settings = settings_of(config, dataset, split, learner)
     folder = runs.RunFolder(path, settings, config.restart)
     try:
@@ -148,6 +150,8 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
             done = f"{path} is finished; --restart trains it anew, --seed n another."
             console.print(done, soft_wrap=True)
             return runs.read_json(path / runs.EVALUATION)
+        if data.in_file:
+            console.print("The training data are read from a file; more --memory avoids it.")
         _meta_train(config, learner, folder, console)
         return _evaluate(config, learner, folder, split, best_behavior(dataset))
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,15 @@ from ctmrl.methods.base import Dimensions
 from ctmrl.methods.ctmrl import CTMRL, CTMRLConfig
 from ctmrl.networks import Statistics
 from ctmrl.presets import preset
-from datagen.dataset import COLUMNS, Dataset, TaskData, task_file, write_index, write_task
+from datagen.dataset import (
+    COLUMNS,
+    Dataset,
+    Episodes,
+    TaskData,
+    task_file,
+    write_index,
+    write_task,
+)
 from meta_envs import MetaVectorEnv
 from tests.datagen.examples import index_of, task_data
 
@@ -109,9 +117,18 @@ class HandMade(Dataset):
 
     tables: Mapping[int, TaskData]
 
-    def read(self, task: int) -> TaskData:
-        """The task's data."""
-        return self.tables[task]
+    def blocks(self, task: int, rows: int = 2**16) -> Iterator[TaskData]:
+        """The task's data, an episode a block."""
+        del rows
+        data = self.tables[task]
+        for number in range(int(data.episode[-1]) + 1):
+            own = {name: column[data.episode == number] for name, column in data.columns.items()}
+            yield TaskData(task, own, {})
+
+    def episodes(self, task: int) -> Episodes:
+        """The task's episodes."""
+        lengths = np.bincount(self.tables[task].episode)
+        return Episodes(lengths, np.zeros(len(lengths), dtype=np.int32))
 
 
 def hand_made(lengths: Mapping[int, Sequence[int]]) -> HandMade:

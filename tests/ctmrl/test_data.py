@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ctmrl.data import OfflineData
 from ctmrl.errors import UsageError
-from datagen.dataset import DatasetError, open_dataset, task_file
+from ctmrl.table import Room
+from datagen.dataset import DatasetError, Quality, open_dataset, task_file
 from meta_envs import task_set
 from tests.ctmrl.examples import ACT, OBS, generator, open_hand_made
 from tests.datagen.examples import graded_data, write_tasks
@@ -165,6 +166,41 @@ def test_statistics_against_numpy(wind_path: Path, next_obs: bool) -> None:
     for (mean, std), values in zip(found, wanted, strict=True):
         np.testing.assert_allclose(mean, values.mean(axis=0), atol=1e-5)
         np.testing.assert_allclose(std, values.std(axis=0, ddof=1), rtol=1e-4)
+
+
+def test_statistics_are_exactly_those_of_the_whole_columns(wind_data: OfflineData) -> None:
+    """Published runs rest on every bit of them."""
+    obs, change = wind_data.table[:, :2], wind_data.table[:, 5:7] - wind_data.table[:, :2]
+    before = wind_data.table[:, :5]
+    for next_obs in (True, False):
+        seen = torch.cat([before, change], dim=1) if next_obs else before
+        wanted = obs, seen, torch.cat([before[:, -1:], change], dim=1)
+        found = wind_data.statistics(next_obs)
+        for (mean, std), values in zip(found, wanted, strict=True):
+            assert mean.equal(values.mean(dim=0))
+            assert std.equal(values.std(dim=0))
+
+
+@pytest.mark.parametrize("quality", ["mixed", "early"])
+def test_a_table_in_a_file_is_the_same(quality: Quality, wind_path: Path, tmp_path: Path) -> None:
+    part = open_dataset(wind_path).select(quality)
+    memory, file = (
+        OfflineData(part, part.train_tasks, room=Room(gigabytes, tmp_path)) for gigabytes in (1, 0)
+    )
+    assert (memory.in_file, file.in_file) == (False, True)
+    assert file.table.equal(memory.table)
+    for next_obs in (True, False):
+        pairs = zip(file.statistics(next_obs), memory.statistics(next_obs), strict=True)
+        assert all(a.equal(b) for one, other in pairs for a, b in zip(one, other, strict=True))
+
+
+def test_rows_drawn_are_those_of_the_batch(data: OfflineData) -> None:
+    tasks = torch.tensor([2, 0])
+    rows = data.batch_rows(tasks, 5, generator())
+    assert data.table[rows, :OBS].equal(data.transitions(tasks, 5, generator()).obs)
+    rows = data.context_rows(tasks, 2, 2, 5, generator())
+    found = data.contexts(tasks, 2, 2, 5, generator())
+    assert data.table[rows, : found.shape[-1]].equal(found.flatten(0, 2))
 
 
 def test_contexts_see_sparse_rewards_and_batches_dense_ones(sparse_path: Path) -> None:

@@ -171,18 +171,39 @@ def test_an_interrupted_and_twice_killed_run_ends_in_the_same_bytes(
     assert contents(path) == contents(finished_run.path)
 
 
-@pytest.mark.slow
-def test_runs_killed_at_20_random_moments_end_in_the_same_bytes(
+def test_a_killed_run_with_its_data_in_a_file_ends_in_the_same_bytes(
     finished_run: FinishedRun, commands: Commands, tmp_path: Path
 ) -> None:
+    path = tmp_path / "run"
+    words = (*finished_run.words, "--memory", "0", "--out", str(path))
+    commands.start(*words)
+    wait_until(lambda: rows(path / "metrics.csv") > 5)
+    commands.send(signal.SIGKILL)
+    assert commands.wait() == -signal.SIGKILL
+    said = "The training data are read from a file; more --memory avoids it."
+    assert commands.output().splitlines()[0] == said
+    # The file went with the process.
+    left = {name for name in contents(path) if not name.endswith(".partial")}
+    assert left <= {*FILES}
+    assert [one.name for one in tmp_path.iterdir()] == ["run"]
+    assert commands.run(*words) == 0, commands.output()
+    assert contents(path) == contents(finished_run.path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gigabytes", ["1", "0"])
+def test_runs_killed_at_20_random_moments_end_in_the_same_bytes(
+    gigabytes: str, finished_run: FinishedRun, commands: Commands, tmp_path: Path
+) -> None:
     wanted = contents(finished_run.path)
+    common = (*finished_run.words, "--memory", gigabytes)
     begun = time.monotonic()
-    assert commands.run(*finished_run.words, "--out", str(tmp_path / "whole")) == 0
+    assert commands.run(*common, "--out", str(tmp_path / "whole")) == 0
     length = time.monotonic() - begun
     draw, killed, had_checkpoint = random.Random(0), 0, 0
     for number in range(20):
         path = tmp_path / str(number)
-        words = (*finished_run.words, "--out", str(path))
+        words = (*common, "--out", str(path))
         commands.start(*words)
         time.sleep(length * (number + draw.random()) / 20)
         # The last ones may have ended by themselves, if the machine has become quicker.

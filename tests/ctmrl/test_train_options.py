@@ -77,6 +77,7 @@ def mistake(
         ),
         (("--steps", "0"), "--steps must be at least 1, got 0"),
         (("--tau", "nan"), "--tau must be at least 1e-09, got nan"),
+        (("--memory", "-1"), "--memory must be at least 0, got -1.0"),
         (("--seed", "-1"), "--seed must be from 0 to 9.22337e+18, got -1"),
     ],
 )
@@ -195,6 +196,7 @@ def test_help_shows_the_options_of_the_method(capsys: pytest.CaptureFixture[str]
          preset("point_robot_wind", "ctmrl", "smoke", seed=7)),
         (["--quality", "expert", "--data-episodes", "10"],
          preset("point_robot_wind", "ctmrl", "standard", quality="expert", data_episodes=10)),
+        (["--memory", "1.5"], preset("point_robot_wind", "ctmrl", "standard", memory=1.5)),
         (["--seed", "7", "--data", "d", "--out", "o", "--restart", "--validate"],
          preset("point_robot_wind", "ctmrl", "standard", seed=7, data=Path("d"), out=Path("o"),
                 restart=True, validate=True)),
