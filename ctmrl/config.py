@@ -73,8 +73,9 @@ class RunConfig:
     """Throw away what the run folder holds and begin anew."""
     threads: int = 1
     """Threads of the numerical libraries; part of what makes a run repeatable."""
-    tensorboard: bool = False
-    """Also write TensorBoard events (needs the extra: pip install 'ctmrl[tensorboard]')."""
+    loggers: tuple[str, ...] = ()
+    """Where metrics go beside metrics.csv: any of tensorboard, trackio and wandb, each an extra
+    (pip install 'ctmrl[wandb]'). docs/metrics.md lists the metrics."""
 
     @property
     def label(self) -> str:
