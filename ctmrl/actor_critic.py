@@ -106,7 +106,8 @@ class ActorCritic(nn.Module):
             Scalar sum of the losses, and scalars by metric name.
         """
         target = self.critic_target(batch, z)
-        critic = (self.critic(batch.obs, batch.action, z) - target).square().mean(dim=1).sum()
+        at_data = self.critic(batch.obs, batch.action, z)
+        critic = (at_data - target).square().mean(dim=1).sum()
         sample = self.actor.sample(batch.obs, z, generator)
         q = self.critic(batch.obs, sample.action, z, frozen=True).amin(dim=0)
         entropy_cost = self.entropy_coef * sample.log_prob
@@ -115,11 +116,12 @@ class ActorCritic(nn.Module):
         actor = (entropy_cost - q).mean()
         actor = actor + self.entropy_coef * self.config.regularizer * regularizer
         metrics = {
+            "policy/q": q.detach().mean(),
+            "policy/q_largest": torch.maximum(at_data.abs().amax(), q.abs().amax()).detach(),
             "loss/critic": critic.detach(),
             "loss/value": value.detach(),
             "loss/actor": actor.detach(),
             "policy/entropy": -sample.log_prob.detach().mean(),
-            "policy/q": q.detach().mean(),
         }
         if self.multiplier is not None:
             metrics["loss/dual_critic"] = self._update_dual(

@@ -98,6 +98,17 @@ class Codebook(nn.Module):
             self.codes[dead[: len(lonely)]] = centres[lonely]
 
 
+SHARE = "codes/share/"
+"""What the names of the codes' shares begin with; a code's index follows."""
+
+
+def usage(matched: Tensor, n_codes: int) -> dict[str, Tensor]:
+    """Metrics of how the tasks of a batch use the codes: perplexity, and the share of each code."""
+    shares = torch.bincount(matched, minlength=n_codes) / len(matched)
+    named = {f"{SHARE}{index}": share for index, share in enumerate(shares.unbind())}
+    return {"codes/perplexity": perplexity(matched, n_codes), **named}
+
+
 def perplexity(matched: Tensor, n_codes: int) -> Tensor:
     """How many codes are in use, exp of the entropy of the assignment; 1 to N."""
     share = torch.bincount(matched, minlength=n_codes) / len(matched)

@@ -78,8 +78,9 @@ class RunConfig:
     """GB of memory the training data may take as a table; default half of what is available. A
     larger table is read from a file beside the run, which ends with the process and changes no
     result; 0 always does that."""
-    tensorboard: bool = False
-    """Also write TensorBoard events (needs the extra: pip install 'ctmrl[tensorboard]')."""
+    loggers: tuple[str, ...] = ()
+    """Where metrics go beside metrics.csv: any of tensorboard, trackio and wandb, each an extra
+    (pip install 'ctmrl[wandb]'). docs/metrics.md lists the metrics."""
 
     @property
     def label(self) -> str:

@@ -7,20 +7,32 @@ import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
 
+from rich.columns import Columns
 from rich.console import Console
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from ctmrl.errors import UsageError
+from ctmrl.errors import Diverged, UsageError
 from datagen.dataset import DatasetError
+
+KINDS = {
+    "return": "return",
+    "loss/encoder": "encoder losses",
+    "contexts": "contexts",
+    "codes": "codes",
+    "loss": "losses",
+    "policy": "policy",
+    "divergence": "divergence",
+}
+"""Kinds of metrics as the live table has them, by what the metrics' names begin with."""
 
 
 def run_command(command: Callable[[], None]) -> int:
     """Run a command; a user's mistake, or a disk's refusal, becomes one sentence on stderr.
 
     Returns:
-        The exit code: 0, 2 for a mistake or a refusal, 130 for Ctrl-C.
+        The exit code: 0, 1 for a run that diverged, 2 for a mistake or a refusal, 130 for Ctrl-C.
     """
     try:
         command()
@@ -29,7 +41,7 @@ def run_command(command: Callable[[], None]) -> int:
         return 130
     except (UsageError, DatasetError, OSError) as error:
         sys.stderr.write(f"error: {error}\n")
-        return 2
+        return 1 if isinstance(error, Diverged) else 2
     return 0
 
 
@@ -49,7 +61,7 @@ class TrainingDisplay:
         self._begun = time.monotonic()
         self._progress = Progress(
             TextColumn("meta-training"),
-            BarColumn(),
+            BarColumn(bar_width=30),
             TaskProgressColumn(),
             TextColumn("{task.fields[rate]:.0f} steps/s"),
             TimeRemainingColumn(),
@@ -113,10 +125,20 @@ class TrainingDisplay:
         return f"codes in use {metrics['codes/perplexity']:.1f} of {self.n_codes}; "
 
     def _table(self, metrics: Mapping[str, float | None]) -> Table:
-        table = Table(box=None, show_header=False, padding=(0, 2))
-        for key, value in metrics.items():
-            if key == "return/training_tasks":
-                value = self._return
-            if key != "step":
-                table.add_row(key, "-" if value is None else f"{value:.4f}")
+        """A row for each kind of metric, a few characters for each metric."""
+        known = {key: value for key, value in metrics.items() if value is not None}
+        if self._return is not None:
+            known["return/training_tasks"] = self._return
+        kinds: dict[str, list[str]] = {kind: [] for kind in KINDS}
+        for key, value in known.items():
+            kind, _, name = key.rpartition("/")
+            if kind in kinds:
+                kinds[kind].append(f"{name.replace('_', ' ')} {value:.3g}")
+        shares = [f"{100 * v:.0f}" for k, v in known.items() if k.startswith("codes/share/")]
+        if shares:
+            kinds["codes"].append(f"shares {' '.join(shares)} %")
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+        for kind, said in kinds.items():
+            if said:
+                table.add_row(KINDS[kind], Columns(said, padding=(0, 3)))
         return table

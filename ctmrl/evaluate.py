@@ -32,6 +32,9 @@ class EvaluateConfig:
     """Also write the result as JSON and both pictures into this folder."""
     repetitions: int | None = field(default=None)
     """Independent adaptations of each task; the run's own number by default."""
+    unfinished: bool = False
+    """Also score the last checkpoint of a run that has not come to its end, such as one that
+    diverged."""
 
 
 def evaluate_agent(
@@ -142,17 +145,21 @@ def main(config: EvaluateConfig) -> None:
     with runs.fitting(config.run / runs.CHECKPOINT):
         agent = load_agent(run_config, dims, state)
         step = int(state["step"])
-    if step < dims.steps:
+    if step < dims.steps and not config.unfinished:
         raise runs.RunError(
             f"{config.run} stopped at step {step} of {dims.steps}: "
-            "give its training command again to finish it"
+            "give its training command again to finish it, or --unfinished to score it as it is"
         )
     tasks = task_set(run_config.env)
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
     record = evaluate_agent(agent, run_config, tasks, groups, best, seed)
-    Console().print(result_table(record))
+    console = Console()
+    if step < dims.steps:
+        record["step"] = step
+        console.print(f"The checkpoint of step {step} of {dims.steps}.")
+    console.print(result_table(record))
     if config.out is not None:
         config.out.mkdir(parents=True, exist_ok=True)
         write_whole(config.out / runs.EVALUATION, runs.to_json(record))

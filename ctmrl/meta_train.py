@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from torch import Tensor, nn
 
 from ctmrl.actor_critic import ActorCritic
 from ctmrl.agent import Agent, build_method, part
+from ctmrl.codebook import SHARE
 from ctmrl.config import MetaTrainConfig, RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.methods.base import Dimensions
+from ctmrl.soundness import check_sound, q_limit
 
+LARGEST_Q = "policy/q_largest"
+"""The metric that is a maximum over steps; the others are means."""
 LAST_RATE = 0.01
 """Share of the learning rates left at the end of a decaying run."""
 
@@ -64,6 +68,9 @@ class Learner:
             for name, optimizer in self.optimizers.items()
         }
         self._every = torch.arange(len(data))
+        reward = float(torch.linalg.vector_norm(data.unpack(data.table).reward, torch.inf))
+        entropy = self.actor_critic.entropy_coef * data.act_dim
+        self._limits = {LARGEST_Q: q_limit(reward, entropy, config.actor_critic.gamma)}
 
     @property
     def agent(self) -> Agent:
@@ -98,8 +105,15 @@ class Learner:
             self.data.page_in(self.data.context_rows(tasks, sets, *size, ahead))
             self.data.page_in(self.data.batch_rows(tasks, config.batch_size, ahead))
 
-    def update(self) -> dict[str, Tensor]:
-        """One gradient step; scalars by metric name."""
+    def update(self, look: Callable[[dict[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
+        """One gradient step.
+
+        Args:
+            look: called at the end with all the step is made of, in the order it came about.
+
+        Returns:
+            Scalars by metric name.
+        """
         config, method = self.config, self.method
         self._set_rates()
         method.before_step(self.step, self.all_contexts)
@@ -118,7 +132,50 @@ class Learner:
         self.optimizers["main"].step()
         self.actor_critic.follow_value()
         self.step += 1
-        return metrics | more | {"contexts/between": given.std(dim=0).mean()}
+        metrics |= _spread(z.detach()) | more
+        if look is not None:
+            data = {f"data/{name}": values for name, values in batch._asdict().items()}
+            loss = {"loss": context_loss + policy_loss}
+            look({"data/context": contexts, **data, "contexts": z, **metrics, **loss})
+            look(self._gradients_and_parameters())
+        return metrics
+
+    def _gradients_and_parameters(self) -> dict[str, Tensor]:
+        gradients, parameters = {}, {}
+        for owner, module in self._modules().items():
+            for name, parameter in module.named_parameters():
+                parameters[f"{owner}.{name}"] = parameter.detach()
+                if parameter.grad is not None:
+                    gradients[f"the gradient of {owner}.{name}"] = parameter.grad
+        return gradients | parameters
+
+    def check(self, quantities: Mapping[str, Tensor]) -> None:
+        """Check that nothing is wrong with quantities of the step just taken.
+
+        Raises:
+            Diverged: the first one that is not finite, or beyond its limit.
+        """
+        check_sound(self.step, quantities, self._limits)
+
+    def check_all(self, metrics: Mapping[str, Tensor]) -> None:
+        """Check metrics, and all there is to continue from.
+
+        Raises:
+            Diverged: the first one that is not finite, or beyond its limit.
+        """
+        state = {name: x for name, x in self.state().items() if x.is_floating_point()}
+        self.check({**metrics, **state})
+
+    def retrace(self, state: dict[str, Tensor]) -> None:
+        """Take the steps since an earlier, sound state again, looking at everything in each.
+
+        Raises:
+            Diverged: the first thing that is wrong, at its step.
+        """
+        last = self.step
+        self.load(state)
+        while self.step < last:
+            self.update(self.check)
 
     def _set_rates(self) -> None:
         left = 1.0 - self.step / self.config.steps
@@ -161,6 +218,38 @@ class Learner:
             self.actor_critic.multiplier.value = state["multiplier"]
 
 
+def _spread(z: Tensor) -> dict[str, Tensor]:
+    """Standard deviations of contexts [sets, B, Z], means over coordinates.
+
+    That between tasks is of the first set; that within a task needs two sets.
+    """
+    between = {"contexts/between": z[0].std(dim=0).mean()}
+    if len(z) == 1:
+        return between
+    return between | {"contexts/within": z.var(dim=0).mean(dim=0).sqrt().mean()}
+
+
+def _row(step: int, sums: dict[str, Tensor], count: int) -> dict[str, float]:
+    """Mean metrics of `count` steps; with codes also how many no task of them matched."""
+    means = {k: float(v) / (1 if k == LARGEST_Q else count) for k, v in sums.items()}
+    row = {"step": step} | means
+    shares = [value for key, value in row.items() if key.startswith(SHARE)]
+    return row | ({"codes/dead": float(shares.count(0.0))} if shares else {})
+
+
+def _advance(learner: Learner, log_every: int) -> dict[str, float]:
+    """Take the steps up to the next row, and give it; or raise Diverged."""
+    sums: dict[str, Tensor] = {}
+    count = 0
+    while count == 0 or (learner.step % log_every and learner.step < learner.config.steps):
+        for key, value in learner.update().items():
+            add = torch.maximum if key == LARGEST_Q else torch.add
+            sums[key] = add(sums[key], value) if key in sums else value
+        count += 1
+    learner.check_all(sums)
+    return _row(learner.step, sums, count)
+
+
 def meta_train(
     learner: Learner, log_every: int, save: Callable[[], None], save_every: int
 ) -> Iterator[dict[str, float]]:
@@ -171,16 +260,20 @@ def meta_train(
         log_every: steps between two yields; metrics are means over them.
         save: called every `save_every` steps, after the yield that ends there, and at the end.
         save_every: a multiple of `log_every`.
+
+    Raises:
+        Diverged: something went wrong in the steps since the last yield; nothing of them is yielded
+            or saved.
     """
     steps = learner.config.steps
-    sums: dict[str, Tensor] = {}
-    since = 0
     while learner.step < steps:
-        for key, value in learner.update().items():
-            sums[key] = sums[key] + value if key in sums else value
-        since += 1
-        if learner.step % log_every == 0 or learner.step == steps:
-            yield {"step": learner.step} | {k: float(v) / since for k, v in sums.items()}
-            sums, since = {}, 0
-            if learner.step % save_every == 0 or learner.step == steps:
-                save()
+        sound = {key: value.clone() for key, value in learner.state().items()}
+        try:
+            row = _advance(learner, log_every)
+        except Exception:
+            # What went wrong first may be steps behind what was noticed.
+            learner.retrace(sound)
+            raise
+        yield row
+        if learner.step % save_every == 0 or learner.step == steps:
+            save()

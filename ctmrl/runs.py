@@ -19,11 +19,12 @@ from torch import Tensor
 from ctmrl.errors import UsageError
 from datagen.dataset import write_whole
 
-CONFIG, METRICS, CHECKPOINT, EVALUATION = (
+CONFIG, METRICS, CHECKPOINT, EVALUATION, LOGGERS = (
     "config.json",
     "metrics.csv",
     "checkpoint.pt",
     "evaluation.json",
+    "loggers.json",
 )
 
 RUN_FILES = (
@@ -31,6 +32,8 @@ RUN_FILES = (
     CHECKPOINT,
     METRICS,
     "tensorboard",
+    "wandb",
+    LOGGERS,
     "adaptation.png",
     "contexts.png",
     CONFIG,
@@ -223,12 +226,15 @@ class RunFolder:
         write_whole(path, "".join(f"{line}\n" for line in [*lines[:1], *kept]).encode())
 
     def append_metrics(self, row: dict[str, float | None]) -> None:
-        """Add a row; the first one's keys are the columns."""
+        """Add a row; the first one's keys are the columns, also for a later version's rows."""
         path = self.path / METRICS
-        new = not path.exists() or not path.stat().st_size
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(row), lineterminator="\n")
-            if new:
+        with path.open("a+", newline="") as file:
+            file.seek(0)
+            columns = next(csv.reader(file), None)
+            writer = csv.DictWriter(
+                file, columns or list(row), extrasaction="ignore", lineterminator="\n"
+            )
+            if columns is None:
                 writer.writeheader()
             writer.writerow(row)
             file.flush()

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
-from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
 
 LOGS, CHECKPOINTS, RETURNS = 100, 50, 10
 """Rows of metrics, checkpoints, and measured returns on training tasks in a run."""
-NOT_SETTINGS = {"data", "out", "restart", "tensorboard", "memory"}
+NOT_SETTINGS = {"data", "out", "restart", "loggers", "memory"}
 """Fields of RunConfig that do not change a run's results."""
 PACKAGES = ("ctmrl", "numpy", "torch", "gymnasium", "scikit-learn")
 
@@ -122,15 +120,19 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
 
     Raises:
         UsageError: settings or a dataset that cannot be used.
+        Diverged: a quantity that is not finite, or a Q beyond what rewards explain.
     """
     from ctmrl import runs
     from ctmrl.config import check_settings
     from ctmrl.data import OfflineData
+    from ctmrl.errors import Diverged
+    from ctmrl.loggers import check_loggers
     from ctmrl.meta_train import Learner
     from ctmrl.table import Room
     from ctmrl.threads import settle_threads
 
     check_settings(config)
+    check_loggers(config.loggers)
     settle_threads(config.threads)
     dataset = open_data(config)
     split = split_tasks(dataset, config.validate)
@@ -152,10 +154,29 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
             return runs.read_json(path / runs.EVALUATION)
         if data.in_file:
             console.print("The training data are read from a file; more --memory avoids it.")
-        _meta_train(config, learner, folder, console)
+        try:
+            _meta_train(config, learner, folder, console)
+        except Diverged as error:
+            raise Diverged(f"training diverged: {error}; {_way_on(folder)}") from None
         return _evaluate(config, learner, folder, split, best_behavior(dataset))
     finally:
         folder.close()
+
+
+def _way_on(folder: RunFolder) -> str:
+    """Where a run that diverged stands, and what to do."""
+    from ctmrl import runs
+
+    state = folder.checkpoint()
+    if state is None:
+        kept, again = f"{folder.path} has no checkpoint yet", "starts again"
+    else:
+        kept = f"{folder.path / runs.CHECKPOINT} is of step {int(state['step'])}, before it"
+        again = "goes on from there"
+    return (
+        f"{kept}; the same command {again} and stops alike: "
+        "lower --learning-rate or --encoder-lr, with --restart or another --out"
+    )
 
 
 def default_folder(config: RunConfig) -> Path:
@@ -167,7 +188,7 @@ def default_folder(config: RunConfig) -> Path:
 def _meta_train(config: RunConfig, learner: Learner, folder: RunFolder, console: Console) -> None:
     from ctmrl import runs
     from ctmrl.console import TrainingDisplay
-    from ctmrl.errors import UsageError
+    from ctmrl.loggers import open_loggers
     from ctmrl.meta_train import meta_train
 
     state = folder.checkpoint()
@@ -181,28 +202,22 @@ def _meta_train(config: RunConfig, learner: Learner, folder: RunFolder, console:
     save_every = log_every * max(LOGS // CHECKPOINTS, 1)
     measure_every = log_every * max(LOGS // RETURNS, 1)
     n_codes = getattr(config.context, "codes", None)
-    with ExitStack() as stack:
-        writer = None
-        if config.tensorboard:
-            writer = stack.enter_context(_tensorboard(folder.path, learner.step))
-        display = stack.enter_context(TrainingDisplay(console, steps, learner.step, n_codes))
-        for metrics in meta_train(
-            learner, log_every, lambda: folder.save_checkpoint(learner.state()), save_every
-        ):
-            bad = next((key for key, value in metrics.items() if not math.isfinite(value)), None)
-            if bad is not None:
-                raise UsageError(
-                    f"training diverged: {bad} is {metrics[bad]} before step {learner.step}; the "
-                    f"checkpoint in {folder.path} is older; try a lower learning rate"
-                )
+    name = default_folder(config).relative_to("runs").as_posix()
+    with (
+        open_loggers(config.loggers, folder.path, name, learner.step) as loggers,
+        TrainingDisplay(console, steps, learner.step, n_codes) as display,
+    ):
+
+        def save() -> None:
+            folder.save_checkpoint(learner.state())
+            loggers.pass_on()
+
+        for metrics in meta_train(learner, log_every, save, save_every):
             measure = learner.step % measure_every == 0 or learner.step == steps
             value = _training_return(config, learner) if measure else None
             row: dict[str, float | None] = {**metrics, "return/training_tasks": value}
             folder.append_metrics(row)
-            if writer is not None:
-                for key, number in row.items():
-                    if key != "step" and number is not None:
-                        writer.add_scalar(key, number, learner.step)
+            loggers.log(learner.step, row)
             display.show(row)
 
 
@@ -220,18 +235,6 @@ def _training_return(config: RunConfig, learner: Learner) -> float:
         config.seed,
     )
     return float(result.returns.mean())
-
-
-def _tensorboard(path: Path, step: int) -> Any:
-    from ctmrl.errors import UsageError
-
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise UsageError(
-            "--tensorboard needs a package that is not installed: pip install 'ctmrl[tensorboard]'"
-        ) from None
-    return SummaryWriter(str(path / "tensorboard"), purge_step=step + 1)
 
 
 def _evaluate(

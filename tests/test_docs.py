@@ -1,5 +1,6 @@
-"""The documentation's worked example is an environment that passes every check."""
+"""The documentation's worked example passes every check; its list of metrics is complete."""
 
+import dataclasses
 import importlib
 import re
 import sys
@@ -9,9 +10,16 @@ from typing import Any
 
 import pytest
 
+from ctmrl.data import OfflineData
+from ctmrl.meta_train import Learner, meta_train
+from ctmrl.methods import METHODS
+from ctmrl.presets import preset
 from meta_envs.__main__ import main
 from meta_envs.conformance import CHECKS
 from meta_envs.registry import ENVIRONMENTS, unregister
+from tests.ctmrl.conftest import wind_data, wind_path
+
+__all__ = ["wind_data", "wind_path"]
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE = DOCS / "new_environment.md"
@@ -57,3 +65,23 @@ def test_it_can_be_registered_as_the_page_says() -> None:
             assert obs.tolist() == pytest.approx([start[0] + 0.1 * velocity, velocity])
     finally:
         unregister(ENVIRONMENTS["puck_mass"])
+
+
+def documented(page: Path) -> set[str]:
+    """Names of the metrics in the page's table."""
+    _, _, table = page.read_text().partition("| metric |")
+    return set(re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE))
+
+
+def test_every_metric_is_documented_and_every_documented_one_exists(
+    wind_data: OfflineData,
+) -> None:
+    found = {"return/training_tasks"}
+    for method in METHODS:
+        config = preset("point_robot_wind", method, "smoke")
+        brac = dataclasses.replace(config.actor_critic, behavior_regularization=True)
+        training = dataclasses.replace(config.training, steps=1)
+        config = dataclasses.replace(config, training=training, actor_critic=brac)
+        (row,) = meta_train(Learner(config, wind_data), 1, lambda: None, 1)
+        found |= {re.sub(r"/\d+$", "/<i>", name) for name in row}
+    assert found == documented(DOCS / "metrics.md")

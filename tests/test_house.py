@@ -28,7 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "ctmrl": {
         "ctmrl", "datagen.dataset", "meta_envs", "matplotlib", "numpy", "PIL", "safetensors",
-        "scipy", "sklearn", "tensorboard", "torch", *COMMAND_LINE,
+        "scipy", "sklearn", "tensorboard", "torch", "trackio", "wandb", *COMMAND_LINE,
     },
 }  # fmt: skip
 """What a module may import beside the standard library; its longest matching prefix counts."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ctmrl import cqvae
-from ctmrl.codebook import Codebook, check_codes, perplexity
+from ctmrl.codebook import Codebook, check_codes, usage
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
 from ctmrl.networks import Predictors, Statistics
@@ -129,8 +129,7 @@ class CTMRL(Method):
             + config.metric_weight * losses["metric"]
         )
         metrics = {f"loss/encoder/{name}": value.detach() for name, value in losses.items()}
-        metrics["codes/perplexity"] = perplexity(matched, config.codes)
-        return total, metrics
+        return total, metrics | usage(matched, config.codes)
 
     def _prediction(self, context: Tensor, z: Tensor, matched: Tensor) -> tuple[Tensor, Tensor]:
         """L_pre^spe and L_pre^cro, equations (6) and (9), each a mean over tasks."""

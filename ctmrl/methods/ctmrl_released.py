@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ctmrl.club import BehaviorModel, club_loss, likelihood_loss
-from ctmrl.codebook import check_codes, perplexity
+from ctmrl.codebook import check_codes, usage
 from ctmrl.ema_codebook import EMACodebook
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
@@ -177,8 +177,7 @@ class CTMRLReleased(Method):
             + config.contrast_weight * losses["contrast"]
         )
         metrics = {f"loss/encoder/{name}": value.detach() for name, value in losses.items()}
-        metrics["codes/perplexity"] = perplexity(matched, config.codes)
-        return total, metrics
+        return total, metrics | usage(matched, config.codes)
 
     def _prediction_loss(self, context: Tensor, z: Tensor) -> Tensor:
         """Mean squared error of rewards plus that of next states, in the targets' units."""

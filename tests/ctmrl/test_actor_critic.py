@@ -63,6 +63,19 @@ def assert_same(found: list[Tensor], wanted: list[Tensor], scale: float = 1.0) -
     assert any(one.abs().max() > 1e-6 for one in found)
 
 
+def test_the_largest_q_is_of_both_critics_and_both_kinds_of_actions() -> None:
+    rows, z = double_batch(), contexts()
+    for seed in range(4):
+        torch.manual_seed(seed)
+        ac = actor_critic()
+        sampled = ac.actor.sample(rows.obs, z, generator(1)).action.detach()
+        _, metrics = ac.loss(rows, z, generator(1))
+        at_policy = ac.critic(rows.obs, sampled, z).amin(dim=0)
+        wanted = max(at_policy.abs().max(), ac.critic(rows.obs, rows.action, z).abs().max())
+        assert metrics["policy/q_largest"].item() == pytest.approx(wanted.item())
+        assert metrics["policy/q"].item() == pytest.approx(at_policy.mean().item())
+
+
 def test_the_critics_target() -> None:
     ac, rows, z = actor_critic(), double_batch(), contexts()
     found = ac.critic_target(rows, z)

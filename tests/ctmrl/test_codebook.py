@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ctmrl.codebook import Codebook, kmeans, perplexity
+from ctmrl.codebook import Codebook, kmeans, perplexity, usage
 from tests.ctmrl.examples import CODES, Z, generator, normal
 
 SIZES = (13, 29, 7, 17, 23)
@@ -173,3 +173,11 @@ def test_the_codebook_is_in_its_state() -> None:
 )
 def test_perplexity(matched: list[int], n_codes: int, wanted: float) -> None:
     assert perplexity(torch.tensor(matched), n_codes).item() == pytest.approx(wanted, rel=1e-5)
+
+
+def test_the_use_of_the_codes() -> None:
+    found = usage(torch.tensor([3, 0, 3, 3]), 5)
+    shares = [float(found[f"codes/share/{index}"]) for index in range(5)]
+    assert shares == [0.25, 0.0, 0.0, 0.75, 0.0]
+    assert found["codes/perplexity"] == perplexity(torch.tensor([3, 0, 3, 3]), 5)
+    assert len(found) == 6

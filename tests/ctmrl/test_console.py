@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import io
+import re
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from ctmrl.console import TrainingDisplay, run_command
-from ctmrl.errors import UsageError
+from ctmrl.errors import Diverged, UsageError
 from datagen.dataset import DatasetError
 
 ROW: dict[str, float | None] = {
@@ -18,6 +19,9 @@ ROW: dict[str, float | None] = {
     "loss/encoder/contrast": 0.125,
     "loss/actor": 1234.5,
     "codes/perplexity": 2.5,
+    "codes/share/0": 0.62,
+    "codes/share/1": 0.0,
+    "codes/share/2": 0.38,
     "policy/q": -7.0,
     "return/training_tasks": -12.345,
 }
@@ -30,6 +34,7 @@ def failing(error: BaseException) -> None:
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
+        (Diverged("training diverged: q is nan"), 1, "error: training diverged: q is nan\n"),
         (UsageError("no method 'x'"), 2, "error: no method 'x'\n"),
         (DatasetError(Path("d"), "is gone", "get it"), 2, "error: d: is gone; get it\n"),
         (
@@ -57,9 +62,11 @@ def test_a_fault_of_ours_is_not_hidden() -> None:
         run_command(lambda: failing(ZeroDivisionError()))
 
 
-def shown(rows: list[dict[str, float | None]], terminal: bool, n_codes: int | None = 3) -> str:
+def shown(
+    rows: list[dict[str, float | None]], terminal: bool, n_codes: int | None = 3, width: int = 150
+) -> str:
     file = io.StringIO()
-    console = Console(file=file, force_terminal=terminal, width=150)
+    console = Console(file=file, force_terminal=terminal, width=width, color_system=None)
     with TrainingDisplay(console, 60, 0, n_codes) as display:
         for row in rows:
             display.show(row)
@@ -94,17 +101,35 @@ def test_a_method_without_codes() -> None:
 
 
 def test_the_live_table() -> None:
-    text = shown([ROW, {**ROW, "step": 40, "return/training_tasks": None}], terminal=True)
-    assert "meta-training" in text
-    assert "steps/s" in text
-    for key, value in ROW.items():
-        assert key == "step" or f"{key} " in text
-        assert key == "step" or f"{value:.4f}" in text
-    # The last measured return stays in sight.
-    assert text.rindex("-12.3450") > text.index("67%")
-    # And 0 is a return, too.
+    rows = [ROW, {**ROW, "step": 40, "return/training_tasks": None}]
+    last = shown(rows, terminal=True, width=80)
+    last = last[last.index("67%") :]
+    assert "steps/s" in last
+    # Names and values, a kind of metric in each row; the last measured return stays in sight.
+    for kind, said in {
+        "return ": "training tasks -12.3",
+        "encoder losses ": "contrast 0.125",
+        "losses ": "actor 1.23e+03",
+        "codes ": "perplexity 2.5   shares 62 0 38 %",
+        "policy ": "q -7",
+    }.items():
+        (line,) = [line for line in last.splitlines() if line.startswith(kind)]
+        assert said in line
+    assert not [line for line in last.splitlines() if line.startswith("contexts")]
+
+
+def test_a_return_of_0_replaces_the_last_one() -> None:
     later = shown([ROW, {**ROW, "step": 40, "return/training_tasks": 0.0}], terminal=True)
-    assert later.rindex("0.0000") > later.rfind("-12.3450")
+    assert "training tasks 0 " in later[later.index("67%") :]
+
+
+def test_everything_fits_a_terminal_of_80_columns() -> None:
+    many = {f"loss/encoder/quite_a_long_name_{index}": -1.23456e-30 for index in range(9)}
+    shares = {f"codes/share/{index}": 0.05 for index in range(20)}
+    lines = shown([{**ROW, **many, **shares}], terminal=True, width=80).splitlines()
+    plain = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", line) for line in lines]
+    assert max(len(line) for line in plain) <= 80
+    assert "quite a long name 8 -1.23e-30" in "".join(plain)
 
 
 def test_the_live_table_ends_with_an_error() -> None:

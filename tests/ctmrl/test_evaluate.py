@@ -171,7 +171,8 @@ def test_a_run_that_is_not_finished(copy: Path, capsys: pytest.CaptureFixture[st
     state = load_checkpoint(copy / "checkpoint.pt")
     torch.save({**state, "step": torch.tensor(12)}, copy / "checkpoint.pt")
     assert mistake(capsys, copy) == (
-        f"{copy} stopped at step 12 of 40: give its training command again to finish it"
+        f"{copy} stopped at step 12 of 40: give its training command again to finish it, "
+        "or --unfinished to score it as it is"
     )
     (copy / "checkpoint.pt").unlink()
     assert mistake(capsys, copy) == f"{copy} has no checkpoint.pt yet: train it first"

@@ -16,7 +16,7 @@ from ctmrl.config import MetaTrainConfig, RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig, meta_test
-from ctmrl.meta_train import LAST_RATE, Learner, meta_train
+from ctmrl.meta_train import LARGEST_Q, LAST_RATE, Learner, meta_train
 from ctmrl.methods import METHODS
 from ctmrl.methods.base import Reference
 from ctmrl.presets import preset
@@ -277,6 +277,25 @@ def test_fresh_contexts_of_all_tasks(wind_data: OfflineData) -> None:
     assert (first != second).any(dim=1).all()
 
 
+def test_the_spread_of_contexts(wind_data: OfflineData, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = Learner(config_of(), wind_data)
+    seen: list[np.ndarray[Any, Any]] = []
+    loss = learner.method.context_loss
+
+    def spied(contexts: Tensor, z: Tensor, generator: torch.Generator) -> Any:
+        seen.append(z.detach().double().numpy())
+        return loss(contexts, z, generator)
+
+    monkeypatch.setattr(learner.method, "context_loss", spied)
+    metrics = learner.update()
+    ((anchors, positives),) = seen
+    assert metrics["contexts/between"] == pytest.approx(anchors.std(axis=0, ddof=1).mean())
+    # Two contexts of one task: their variance is half of the squared difference.
+    within = np.sqrt(((anchors - positives) ** 2 / 2).mean(axis=0)).mean()
+    assert metrics["contexts/within"] == pytest.approx(within)
+    assert "contexts/within" not in Learner(config_of("focal"), wind_data).update()
+
+
 def test_settings_that_do_not_fit_the_data_are_said_at_once(wind_data: OfflineData) -> None:
     with pytest.raises(UsageError, match=r"contexts need 2 x 4 .*the dataset has 6"):
         Learner(config_of(context_episodes=4), wind_data)
@@ -300,9 +319,13 @@ def test_the_loop_logs_means_and_saves_after_its_logs(
     ):
         step = int(row.pop("step"))
         events.append(("log", step))
+        dead = row.pop("codes/dead")
         for key, value in row.items():
-            wanted = np.mean([one[key] for one in plain[done:step]])
+            over = np.max if key == LARGEST_Q else np.mean
+            wanted = over([one[key] for one in plain[done:step]])
             assert value == pytest.approx(wanted, rel=1e-4, abs=1e-6), key
+        shares = [key for key in row if key.startswith("codes/share/")]
+        assert dead == sum(not any(one[key] for one in plain[done:step]) for key in shares)
         done = step
     logs = [*range(log_every, STEPS, log_every), STEPS]
     saves = [*range(save_every, STEPS, save_every), STEPS]

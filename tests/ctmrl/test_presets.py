@@ -38,7 +38,7 @@ def through_a_file(config: RunConfig) -> dict[str, Any]:
     settings = {
         key: value
         for key, value in dataclasses.asdict(config).items()
-        if key not in ("data", "out", "restart", "tensorboard")
+        if key not in ("data", "out", "restart", "loggers")
     }
     found: dict[str, Any] = json.loads(to_json({"settings": settings}))
     return found

@@ -328,3 +328,11 @@ def test_json_has_a_fixed_order_and_no_nan() -> None:
 def test_flatten() -> None:
     nested = {"a": {"b": 1, "c": {"d": [2]}}, "e": None}
     assert runs.flatten(nested) == {"a.b": 1, "a.c.d": [2], "e": None}
+
+
+def test_rows_of_a_later_version_keep_the_columns(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run", {}, restart=False)
+    folder.append_metrics({"step": 1, "a": 0.5, "b": 2.0})
+    folder.append_metrics({"step": 2, "new": 9.0, "b": 3.0})
+    folder.close()
+    assert (tmp_path / "run" / "metrics.csv").read_text() == "step,a,b\n1,0.5,2.0\n2,,3.0\n"

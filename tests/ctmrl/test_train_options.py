@@ -20,6 +20,7 @@ from ctmrl.presets import preset
 from ctmrl.train import parse
 from datagen.dataset import task_file
 from meta_envs import ENVIRONMENTS
+from tests.ctmrl.commands import Commands
 from tests.datagen.examples import write_dataset
 
 
@@ -32,6 +33,16 @@ def test_the_module_itself_is_the_command(tmp_path: Path) -> None:
         f"error: no method 'ctmlr'; did you mean 'ctmrl'? (known: {', '.join(METHODS)})\n"
     )
     assert not list(tmp_path.iterdir())
+
+
+def test_a_misspelt_logger(commands: Commands, wind_path: Path, tmp_path: Path) -> None:
+    words = ("ctmrl.train", "--data", str(wind_path), "--out", str(tmp_path / "run"))
+    assert commands.run(*words, "--loggers", "tensorbord") == 2
+    assert commands.output() == (
+        "error: no logger 'tensorbord'; did you mean 'tensorboard'? "
+        "(known: tensorboard, trackio, wandb)\n"
+    )
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture
