@@ -153,7 +153,7 @@ def test_the_command_keeps_the_last_sound_checkpoint_and_stops_alike(
         "--data",
         str(wind_path),
     )
-    words += ("--code-contrast-weight", "3e38", "--out", str(path))
+    words += ("--steps", "60", "--code-contrast-weight", "3e38", "--out", str(path))
     assert commands.run(*words) == 1
     said = commands.output().splitlines()[-1]
     assert said == (

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ctmrl.codebook import perplexity
+from ctmrl.codebook import perplexity, usage
 from ctmrl.config import check_settings
 from ctmrl.data import OfflineData
 from ctmrl.errors import UsageError
@@ -201,7 +201,7 @@ def test_the_loss_is_the_sum_of_all_terms() -> None:
     assert trained(gradients) == {"encoder", "predictors", "behavior_model"}
     assert set(metrics) == {
         *(f"loss/encoder/{term}" for term in (*WEIGHTS, "club_fit", "prediction")),
-        "codes/perplexity",
+        *usage(torch.zeros(1, dtype=torch.int64), CODES),
     }
     method = placed()
     matched = method.codebook.match(method.encoder(contexts().double())[0])
