@@ -75,7 +75,8 @@ class Curves:
     def worth(self) -> NDArray[np.float64]:
         """Best mean return so far above the random policy's, mean over tasks, [C]."""
         best = np.maximum.accumulate(self.returns, axis=1) - self.random[:, None]
-        return best.mean(axis=0)
+        worth: NDArray[np.float64] = best.mean(axis=0)
+        return worth
 
     @property
     def shares(self) -> dict[int, float]:
