@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Protocol, TypeVar
 import tyro
 from rich.console import Console
 
-from datagen.budgets import POINT_FLEET_SIZE, Budget, FleetSettings, budget
+from datagen.budgets import Budget, budget
 from datagen.card import rows_text
 from datagen.collect_task import collect_task
 from datagen.dataset import task_file
@@ -64,8 +64,7 @@ class CollectConfig:
     """Processes, one thread each; by default one a core, 8 at most."""
     engine: Annotated[Literal["fleet", "sb3"] | None, tyro.conf.arg(metavar="fleet|sb3")] = None
     """What trains the behaviour policies: a fleet learns many tasks side by side in one process,
-    sb3 is Stable-Baselines3's SAC, a process a task. By default sb3 for point robots, and a fleet
-    for MuJoCo."""
+    sb3 is Stable-Baselines3's SAC, a process a task. A fleet by default."""
     fleet_size: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Tasks a fleet learns side by side, at most; a setting of the budget by default."""
     precision: Annotated[
@@ -121,11 +120,7 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
         ValueError: an option is wrong, or of the other engine.
     """
     fleet = budget.fleet
-    if config.engine == "sb3":
-        fleet = None
-    elif config.engine == "fleet" and fleet is None:
-        fleet = FleetSettings(POINT_FLEET_SIZE, "auto")
-    if fleet is None:
+    if config.engine == "sb3" or fleet is None:
         for name, value, default in (
             ("fleet-size", config.fleet_size, None),
             ("precision", config.precision, "auto"),
@@ -133,7 +128,7 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
             ("policies", config.policies, None),
         ):
             if value != default:
-                raise ValueError(f"--{name} is for fleets: give --engine fleet with it")
+                raise ValueError(f"--{name} is for fleets, not for --engine sb3")
         return replace(budget, fleet=None)
     if config.fleet_size is not None:
         if config.fleet_size < 1:
@@ -142,9 +137,10 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
     # Loads torch, which --help and mistakes need not wait for.
     from datagen.fleet.networks import check_precision
 
-    return replace(
-        budget, fleet=replace(fleet, precision=check_precision(config.precision, config.device))
-    )
+    precision = check_precision(config.precision, config.device)
+    # Of a device such as cuda:1, what decides the bytes.
+    kind = config.device.partition(":")[0]
+    return replace(budget, fleet=replace(fleet, precision=precision, device=kind))
 
 
 def missing_tasks(plan: Plan) -> tuple[int, ...]:

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,9 @@ from datagen.job import Job, origin
 
 Capture = pytest.CaptureFixture[str]
 TASKS = range(8)
-ARGUMENTS = ("--env", "point_robot_wind", "--budget", "smoke", "--seed", "5", "--tasks", "0-7")
+ROBOTS = ("--env", "point_robot_wind", "--budget", "smoke", "--seed", "5", "--tasks", "0-7")
+ARGUMENTS = (*ROBOTS, "--engine", "sb3")
+SMOKE = replace(budget("point_robot_wind", "smoke"), fleet=None)
 # Ctrl-C is ignored by programs that a shell starts in the background, and by their children.
 PROGRAM = (
     "import signal, sys\n"
@@ -89,14 +92,14 @@ def test_it_makes_an_intact_dataset_with_a_card(original: Path, capsys: Capture)
     assert said.err == "", "a warning would name a file that does not belong there"
     dataset = open_dataset(original)
     assert dataset.tasks.tolist() == list(TASKS)
-    assert dataset.index["config"] == budget("point_robot_wind", "smoke").config()
+    assert dataset.index["config"] == SMOKE.config()
     card = (original / "README.md").read_text()
-    assert "--env point_robot_wind --budget smoke --tasks 0-7 --seed 5\n" in card
+    assert "--env point_robot_wind --budget smoke --engine sb3 --tasks 0-7 --seed 5\n" in card
 
 
 def test_a_file_does_not_depend_on_what_else_ran(original: Path, tmp_path: Path) -> None:
     # Task 7 alone in this very process, the fixture's in workers that did others before.
-    job = Job("point_robot_wind", 7, budget("point_robot_wind", "smoke"), 5, tmp_path)
+    job = Job("point_robot_wind", 7, SMOKE, 5, tmp_path)
     collect_task(job)
     assert (tmp_path / "task_007.h5").read_bytes() == (original / "task_007.h5").read_bytes()
 

@@ -200,6 +200,7 @@ def test_a_damaged_file_is_named(
         (0, replace(TINY, sac=replace(TINY.sac, gamma=0.5))),
         (0, replace(TINY, fleet=FleetSettings(2, "bfloat16"))),
         (0, replace(TINY, fleet=FleetSettings(9, "float32"))),
+        (0, replace(TINY, fleet=FleetSettings(2, "float32", "cuda"))),
         (0, replace(TINY, checkpoints=(40, 50))),
     ],
 )
