@@ -25,11 +25,12 @@ from datagen.estimate import seconds_of
 from datagen.finished import (
     check_origin,
     remove_stale,
+    remove_states,
     scan,
     without_versions,
     write_summary,
 )
-from datagen.job import Job, group_file, origin
+from datagen.job import Job, origin
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration
 from datagen.workers import Event, WorkerError, run_jobs
@@ -204,8 +205,7 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
             remove_stale(plan.folder)
     try:
         index = write_summary(plan.folder, origin(plan.env, plan.budget, plan.seed))
-        for group in plan.groups:
-            group_file(plan.folder, group).unlink(missing_ok=True)
+        remove_states(plan.folder)
         return index
     except OSError as error:
         raise CollectionError(
