@@ -113,6 +113,10 @@ class Budget:
         """Episodes of a task."""
         return self.episodes * len(self.checkpoints)
 
+    def groups(self, tasks: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+        """Tasks in groups that are trained side by side; each alone without a fleet."""
+        return groups_of(tasks, self.fleet.size if self.fleet else 1)
+
     def config(self) -> dict[str, Any]:
         """All of it as JSON values, without the name."""
         values = asdict(self)

@@ -55,8 +55,9 @@ class CollectConfig:
     tasks: Annotated[str | None, tyro.conf.arg(metavar="0-9,12")] = None
     """Tasks to collect; all by default."""
     shard: Annotated[str | None, tyro.conf.arg(metavar="I/N")] = None
-    """Collect every N-th of these tasks from the I-th on, I from 0, to share them with machines
-    that see the same folder."""
+    """Collect every N-th group of these tasks from the I-th on, I from 0, to share them with
+    machines that see the same folder; --dry-run says how many groups there are. Without a fleet
+    each task is a group."""
     seed: int = 0
     """Seed of everything random."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -103,7 +104,8 @@ def plan_of(config: CollectConfig) -> Plan:
     """
     env = resolve(config.env).name
     wanted = with_engine(budget(env, config.budget, config.episodes), config)
-    tasks = parse_shard(config.shard, parse_tasks(config.tasks, task_set(env)))
+    tasks = parse_tasks(config.tasks, task_set(env))
+    groups = parse_shard(config.shard, wanted.groups(tasks))
     if config.seed < 0:
         raise ValueError(f"--seed must not be negative, got {config.seed}")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -111,7 +113,7 @@ def plan_of(config: CollectConfig) -> Plan:
     if workers < 1:
         raise ValueError(f"--workers must be at least 1, got {workers}")
     folder = config.out or Path("datasets") / env
-    return Plan(env, tasks, wanted, config.seed, folder, workers, config.device, config.policies)
+    return Plan(env, groups, wanted, config.seed, folder, workers, config.device, config.policies)
 
 
 def with_engine(budget: Budget, config: CollectConfig) -> Budget:
@@ -306,6 +308,7 @@ def describe(plan: Plan, console: Console) -> None:
     lines = {
         "dataset": f"{plan.folder}, budget {budget.name}, seed {plan.seed}",
         "tasks": f"{rows_text(plan.tasks)} ({len(plan.tasks)} tasks, {len(missing)} to collect)",
+        **({"groups": _groups_text(plan.groups)} if budget.fleet else {}),
         "training": f"{marks[-1]:,} steps a task, the first {budget.random_steps:,} random",
         "checkpoints": f"{len(marks)}, from {marks[0]:,} to {marks[-1]:,} steps",
         "episodes": f"{budget.episodes} each checkpoint, {budget.total_episodes:,} a task",
@@ -316,6 +319,12 @@ def describe(plan: Plan, console: Console) -> None:
     if missing:
         time = duration(seconds_of(plan, missing))
         _say(console, f"{'time:':13}about {time} with {_count(plan.workers, 'worker')}")
+
+
+def _groups_text(groups: Sequence[tuple[int, ...]]) -> str:
+    """How many groups of how many tasks; their sizes differ by one at most."""
+    sizes = sorted({len(group) for group in groups})
+    return f"{len(groups)} of {' or '.join(map(str, sizes))} {'task' if sizes == [1] else 'tasks'}"
 
 
 def _count(number: int, noun: str) -> str:

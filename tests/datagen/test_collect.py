@@ -179,7 +179,7 @@ def test_a_damaged_file_is_named(folder: Path, capsys: Capture) -> None:
         (["--tasks", "3-"], "--tasks takes numbers and ranges such as 0-9,12, got '3-'"),
         (["--tasks", "49-50"], "has tasks 0 to 49, got '49-50'"),
         (["--shard", "2/2"], "--shard takes i/n with i from 0 to n - 1"),
-        (["--shard", "8/9"], "--shard 8/9 of 8 tasks is empty"),
+        (["--shard", "8/9"], "--shard 8/9 is empty: there are 8 groups of tasks"),
         (["--seed", "-1"], "--seed must not be negative, got -1"),
         (["--workers", "0"], "--workers must be at least 1, got 0"),
         (["--episodes", "0"], "episodes must be at least 1, got 0"),
@@ -222,7 +222,13 @@ def test_a_dry_run_touches_nothing(
     assert lines[-2].endswith("at most 1,600 rows, 0.1 MB")
     assert re.fullmatch(r"time: +about \d+ s with 1 worker", lines[-1])
     assert contents(folder) == before
-    assert main([*ARGUMENTS, "--out", str(folder / "new"), "--dry-run"]) == 0
+    fleet = ("--fleet-size", "3", "--out", str(folder / "new"), "--dry-run")
+    assert main([*ROBOTS, *fleet, "--shard", "0/2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1:3] == [
+        "tasks:       0-1,5-7 (5 tasks, 5 to collect)",
+        "groups:      2 of 2 or 3 tasks",
+    ]
     assert not (folder / "new").exists()
 
 

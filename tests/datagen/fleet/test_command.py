@@ -24,6 +24,7 @@ from datagen.card import remake_command
 from datagen.collect import CollectConfig, main, plan_of
 from datagen.dataset import open_dataset
 from datagen.fleet.networks import best_precision
+from datagen.fleet.state import save_state
 from datagen.job import group_file
 from datagen.plan import Plan
 from meta_envs import MetaVectorEnv
@@ -31,6 +32,7 @@ from meta_envs import MetaVectorEnv
 Capture = pytest.CaptureFixture[str]
 HOPPERS = ("--env", "hopper_params", "--budget", "smoke", "--tasks", "0-2", "--workers", "1")
 ROBOTS = ("--env", "point_robot_wind", "--budget", "smoke", "--tasks", "0-1", "--workers", "1")
+PAIRS = (*HOPPERS, "--fleet-size", "2")
 SB3 = (*HOPPERS, "--engine", "sb3")
 
 
@@ -151,6 +153,49 @@ def test_mistakes_are_one_sentence(
     assert said.err.count("\n") == 1
     assert said.out == ""
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_shards_are_the_groups_of_the_whole(count: int) -> None:
+    def asked(shard: str | None) -> Plan:
+        tasks, size = "0-9,20", 4
+        return plan_of(
+            CollectConfig("ant_goal", "smoke", tasks=tasks, fleet_size=size, shard=shard)
+        )
+
+    shards = [asked(f"{index}/{count}") for index in range(count)]
+    assert sorted(group for shard in shards for group in shard.groups) == list(asked(None).groups)
+
+
+@pytest.mark.slow
+def test_all_shards_together_have_the_same_bytes(tmp_path: Path) -> None:
+    whole, shards = tmp_path / "whole", tmp_path / "shards"
+    assert main([*PAIRS, "--out", str(whole)]) == 0
+    for shard in ("1/2", "0/2"):
+        assert main([*PAIRS, "--shard", shard, "--out", str(shards)]) == 0
+    assert contents(shards) == contents(whole)
+
+
+def test_an_interrupted_collection_of_other_tasks_leaves_nothing(
+    hoppers: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(hoppers, tmp_path / "data")
+    finished, other = group_file(folder, (0, 2)), group_file(folder, (2, 3))
+    for path, group in ((finished, [0, 2]), (other, [2, 3])):
+        save_state(path, {}, {"origin": {"group": group}})
+    assert main([*HOPPERS, "--out", str(folder)]) == 0
+    assert not finished.exists()
+    assert other.exists(), "task 3 has no file: it may be another shard's"
+
+
+def test_another_device_is_another_collection(
+    hoppers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    folder = shutil.copytree(hoppers, tmp_path / "data")
+    monkeypatch.setattr("datagen.fleet.networks.check_precision", lambda *_: best_precision())
+    assert main([*HOPPERS, "--device", "cuda:1", "--out", str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert "was collected with config.fleet.device 'cpu', not 'cuda'; give the same options" in said
 
 
 def test_a_damaged_training_is_one_sentence(tmp_path: Path, capsys: Capture) -> None:
