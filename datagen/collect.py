@@ -8,18 +8,17 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
 from datagen.budgets import Budget, budget
 from datagen.card import rows_text
-from datagen.collect_task import collect_task
 from datagen.dataset import task_file
 from datagen.estimate import seconds_of
 from datagen.finished import (
@@ -33,7 +32,8 @@ from datagen.finished import (
 from datagen.job import Job, origin
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration
-from datagen.workers import Event, WorkerError, run_jobs
+from datagen.stages import collect_tasks, train_groups
+from datagen.workers import WorkerError
 from meta_envs import resolve, task_set
 
 MOST_WORKERS = 8
@@ -63,7 +63,12 @@ class CollectConfig:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The dataset's folder; datasets/ENV by default."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Processes, one thread each; by default one a core, 8 at most."""
+    """Processes, one thread each; by default one a core, 8 at most, and with --ray as many as the
+    cluster has free cores."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Train and roll out on a Ray cluster instead of on this machine: auto for the one that runs
+    here, HOST:PORT, or local to start one. Its machines must see the dataset's folder under the
+    same path, and have the same versions of the packages. Needs pip install 'ctmrl[ray]'."""
     engine: Annotated[Literal["fleet", "sb3"] | None, tyro.conf.arg(metavar="fleet|sb3")] = None
     """What trains the behaviour policies: a fleet learns many tasks side by side in one process,
     sb3 is Stable-Baselines3's SAC, a process a task. A fleet by default."""
@@ -108,12 +113,25 @@ def plan_of(config: CollectConfig) -> Plan:
     groups = parse_shard(config.shard, wanted.groups(tasks))
     if config.seed < 0:
         raise ValueError(f"--seed must not be negative, got {config.seed}")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    workers = min(cores or 1, MOST_WORKERS) if config.workers is None else config.workers
+    workers = config.workers
+    if workers is None:
+        workers = len(tasks) if config.ray else min(_cores(), MOST_WORKERS)
     if workers < 1:
         raise ValueError(f"--workers must be at least 1, got {workers}")
-    folder = config.out or Path("datasets") / env
-    return Plan(env, groups, wanted, config.seed, folder, workers, config.device, config.policies)
+    folder, policies = config.out or Path("datasets") / env, config.policies
+    if config.ray:
+        # Processes elsewhere have working folders of their own.
+        folder, policies = folder.absolute(), policies and policies.absolute()
+    return Plan(
+        env, groups, wanted, config.seed, folder, workers, config.device, policies, config.ray
+    )
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def with_engine(budget: Budget, config: CollectConfig) -> Budget:
@@ -173,11 +191,16 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
         The index.
 
     Raises:
-        ValueError: the folder cannot be made or written to.
+        ValueError: the folder cannot be made or written to, or there is no Ray.
         DatasetError: a file in the folder is damaged or was collected in another way.
         CollectionError: a worker failed or a file could not be written.
         InterruptedCollectionError: Ctrl-C.
     """
+    with _cluster(plan):
+        return _collect(plan, console)
+
+
+def _collect(plan: Plan, console: Console) -> dict[str, Any]:
     _prepare(plan.folder)
     if plan.policies is not None:
         _prepare(plan.policies, "--policies")
@@ -194,8 +217,8 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
     with CollectionDisplay(console, len(plan.tasks), len(wanted), plan.budget) as display:
         try:
             if plan.budget.fleet:
-                _train(jobs, wanted, plan, display)
-            _run(wanted, plan.workers, display)
+                train_groups(jobs, wanted, plan, display)
+            collect_tasks(wanted, plan, display)
         except KeyboardInterrupt:
             raise InterruptedCollectionError(_done(plan), len(plan.tasks)) from None
         except WorkerError as error:
@@ -215,6 +238,15 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
         ) from error
 
 
+def _cluster(plan: Plan) -> AbstractContextManager[None]:
+    """The connection to Ray, where it is asked for."""
+    if plan.ray is None:
+        return nullcontext()
+    from datagen.ray_jobs import connected
+
+    return connected(plan.ray)
+
+
 def _done(plan: Plan) -> int:
     """Tasks with a file, also of a worker that was stopped before it could say so."""
     return sum((plan.folder / task_file(task)).exists() for task in plan.tasks)
@@ -230,70 +262,6 @@ def _prepare(folder: Path, option: str = "--out") -> None:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ValueError(f"{option} {folder} cannot be written to, choose another")
     remove_stale(folder)
-
-
-def _train(
-    jobs: Sequence[Job], wanted: Sequence[Job], plan: Plan, display: CollectionDisplay
-) -> None:
-    """Train the groups of all wanted tasks, as far as that has not been done.
-
-    Raises:
-        DatasetError: the file of a group is damaged or of another training.
-        WorkerError: a group could not be trained.
-    """
-    from datagen.fleet.training import FleetJob, check_group, train_fleet
-
-    groups = {job.group for job in wanted}
-    fleets = [
-        FleetJob(tuple(job for job in jobs if job.group == group), plan.device)
-        for group in plan.groups
-        if group in groups
-    ]
-    for fleet in fleets:
-        check_group(fleet)
-    missing = {job.task for job in wanted}
-    for fleet, event in _events(train_fleet, fleets, plan.workers):
-        # Some of a group may be finished, where a file of it was lost.
-        tasks = tuple(task for task in fleet.tasks if task in missing)
-        if event.kind == "started":
-            display.started(tasks)
-        elif event.kind == "done":
-            display.trained(tasks)
-        elif isinstance(event.value, int):
-            display.step(tasks, event.value)
-
-
-def _run(jobs: Sequence[Job], workers: int, display: CollectionDisplay) -> None:
-    for job, event in _events(collect_task, jobs, workers):
-        if event.kind == "started":
-            display.started(job.tasks)
-        elif isinstance(event.value, int):
-            display.step(job.tasks, event.value)
-        elif event.value is not None:
-            display.done(job.task, event.value)
-
-
-class _HasTasks(Protocol):
-    @property
-    def tasks(self) -> tuple[int, ...]: ...
-
-
-J = TypeVar("J", bound=_HasTasks)
-R = TypeVar("R")
-
-
-def _events(
-    work: Callable[[J, Callable[[int], None]], R], jobs: Sequence[J], workers: int
-) -> Iterator[tuple[J, Event[R]]]:
-    """Run jobs on workers; each event with its job, and a failure with its tasks' numbers."""
-    try:
-        with closing(run_jobs(work, jobs, workers)) as events:
-            for event in events:
-                yield jobs[event.index], event
-    except WorkerError as error:
-        where = rows_text(jobs[error.index].tasks)
-        noun = "task" if len(jobs[error.index].tasks) == 1 else "tasks"
-        raise WorkerError(error.index, f"{noun} {where}: {error}") from None
 
 
 def describe(plan: Plan, console: Console) -> None:

@@ -30,6 +30,7 @@ class Plan:
         workers: processes at most.
         device: where a fleet learns, torch's name for it.
         policies: folder for a fleet's last policies as files of Stable-Baselines3's, or None.
+        ray: address of the Ray cluster that does the work, or None for processes of this machine.
     """
 
     env: str
@@ -40,6 +41,7 @@ class Plan:
     workers: int
     device: str = "cpu"
     policies: Path | None = None
+    ray: str | None = None
 
     @property
     def tasks(self) -> tuple[int, ...]:
