@@ -58,15 +58,16 @@ class FakeRay:
     cancelled: list[Ref] = field(default_factory=list)
     at_once: int = 0
     killed: int = 0
-    is_up: bool = False
+    connections: int = 0
 
     def init(self, **options: Any) -> None:
         if self.refuse:
             raise self.refuse
-        self.init_options, self.is_up = options, True
+        self.init_options = options
+        self.connections += 1
 
     def shutdown(self) -> None:
-        self.is_up = False
+        self.connections -= 1
 
     def remote(self, **options: Any) -> Callable[[Any], Any]:
         def wrap(target: Any) -> Any:

@@ -122,16 +122,16 @@ def test_a_machine_with_other_versions_is_named(
 
 def test_a_connection_is_quiet_has_one_thread_each_and_ends(fake: FakeRay) -> None:
     with connected("auto"):
-        assert fake.is_up
+        assert fake.connections == 1
         assert fake.init_options["address"] == "auto"
         assert fake.init_options["include_dashboard"] is False
         variables = fake.init_options["runtime_env"]["env_vars"]
         assert variables == dict.fromkeys(THREAD_VARIABLES, "1")
         assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
-    assert not fake.is_up
+    assert fake.connections == 0
     with pytest.raises(KeyError), connected("local"):
         raise KeyError
-    assert not fake.is_up
+    assert fake.connections == 0
 
 
 def unused_port() -> int:
