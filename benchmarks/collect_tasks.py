@@ -2,8 +2,8 @@ r"""Seconds of data collection: a learning step, a checkpoint's episodes, a task
 
     python benchmarks/collect_tasks.py --repetitions 5 --out benchmarks/results/collect_tasks.csv
 
-One process with one thread, as a worker of `python -m datagen.collect` is. A task is reckoned from
-its parts; `--whole` collects one as well, which the reckoning can be compared with.
+One process with one thread, as a worker of `python -m datagen.collect --engine sb3` is. A task is
+reckoned from its parts; `--whole` collects one as well, which the reckoning can be compared with.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import platform
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +65,7 @@ class Result:
 
 
 def _measure(name: str, options: Benchmark) -> Result:
-    row = budget(name, options.budget)
+    row = replace(budget(name, options.budget), fleet=None)
     turns = [
         (seconds_a_learning_step(name, row), seconds_a_rollout(name, row.episodes))
         for _ in range(options.repetitions)

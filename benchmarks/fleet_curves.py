@@ -127,7 +127,7 @@ def compare(options: Curves, console: Console) -> None:
     BUDGETS[name] = {**BUDGETS[name], row.name: row}
     for engine, row in engines(options):
         folder = options.work / f"{name}_{engine}"
-        plan = Plan(name, tuple(rows.tolist()), row, 0, folder, options.workers)
+        plan = Plan(name, row.groups(rows.tolist()), row, 0, folder, options.workers)
         index = collect(plan, console)
         marks = list(row.checkpoints)
         curves[engine] = np.array(

@@ -43,8 +43,6 @@ def groups_of(tasks: Sequence[int], size: int) -> tuple[tuple[int, ...], ...]:
 
 Precision = Literal["float32", "bfloat16"]
 """Of a fleet's matrix products and what lies between them; parameters are always float32."""
-POINT_FLEET_SIZE = 50
-"""Tasks of a group where a fleet is asked for and the budget has none."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +53,12 @@ class FleetSettings:
         size: tasks of a group, at most; one process trains a group.
         precision: of the matrix products; "auto", the hardware's best, is for budgets alone and
             never for data.
+        device: kind of device that they learn on; which one of several makes no difference.
     """
 
     size: int
     precision: Precision | Literal["auto"]
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Check the size."""
@@ -113,6 +113,10 @@ class Budget:
         """Episodes of a task."""
         return self.episodes * len(self.checkpoints)
 
+    def groups(self, tasks: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+        """Tasks in groups that are trained side by side; each alone without a fleet."""
+        return groups_of(tasks, self.fleet.size if self.fleet else 1)
+
     def config(self) -> dict[str, Any]:
         """All of it as JSON values, without the name."""
         values = asdict(self)
@@ -148,6 +152,7 @@ _POINT_PAPER = Budget(
     episodes=50,
     reference_episodes=1_000,
     sac=_POINT_SAC,
+    fleet=FleetSettings(50, "auto"),
 )
 _POINT_SMOKE = Budget(
     name="smoke",
@@ -157,6 +162,7 @@ _POINT_SMOKE = Budget(
     episodes=4,
     reference_episodes=100,
     sac=replace(_POINT_SAC, hidden=(16, 16), batch_size=32, update_every=10),
+    fleet=FleetSettings(50, "auto"),
 )
 
 
@@ -247,12 +253,11 @@ def other_options(env: str, name: str, config: Mapping[str, Any]) -> list[str]:
     own, episodes, fleet = budget(env, name), int(config["episodes"]), config.get("fleet")
     words = [] if episodes == own.episodes else ["--episodes", str(episodes)]
     if fleet is None:
-        return words if own.fleet is None else [*words, "--engine", "sb3"]
-    if own.fleet is None:
-        words += ["--engine", "fleet"]
-    if fleet["size"] != (own.fleet.size if own.fleet else POINT_FLEET_SIZE):
+        return [*words, "--engine", "sb3"]
+    if own.fleet is None or fleet["size"] != own.fleet.size:
         words += ["--fleet-size", str(fleet["size"])]
-    return [*words, "--precision", str(fleet["precision"])]
+    words += ["--precision", str(fleet["precision"])]
+    return words if fleet["device"] == "cpu" else [*words, "--device", str(fleet["device"])]
 
 
 def budget(env: str, name: str, episodes: int | None = None) -> Budget:

@@ -8,31 +8,32 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, TypeVar
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
-from datagen.budgets import POINT_FLEET_SIZE, Budget, FleetSettings, budget
+from datagen.budgets import Budget, budget
 from datagen.card import rows_text
-from datagen.collect_task import collect_task
 from datagen.dataset import task_file
 from datagen.estimate import seconds_of
 from datagen.finished import (
     check_origin,
     remove_stale,
+    remove_states,
     scan,
     without_versions,
     write_summary,
 )
-from datagen.job import Job, group_file, origin
+from datagen.job import Job, origin
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration
-from datagen.workers import Event, WorkerError, run_jobs
+from datagen.stages import collect_tasks, train_groups
+from datagen.workers import WorkerError
 from meta_envs import resolve, task_set
 
 MOST_WORKERS = 8
@@ -54,18 +55,23 @@ class CollectConfig:
     tasks: Annotated[str | None, tyro.conf.arg(metavar="0-9,12")] = None
     """Tasks to collect; all by default."""
     shard: Annotated[str | None, tyro.conf.arg(metavar="I/N")] = None
-    """Collect every N-th of these tasks from the I-th on, I from 0, to share them with machines
-    that see the same folder."""
+    """Collect every N-th group of these tasks from the I-th on, I from 0, to share them with
+    machines that see the same folder; --dry-run says how many groups there are. Without a fleet
+    each task is a group."""
     seed: int = 0
     """Seed of everything random."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The dataset's folder; datasets/ENV by default."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Processes, one thread each; by default one a core, 8 at most."""
+    """Processes, one thread each; by default one a core, 8 at most, and with --ray as many as the
+    cluster has free cores."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Train and roll out on a Ray cluster instead of on this machine: auto for the one that runs
+    here, HOST:PORT, or local to start one. Its machines must see the dataset's folder under the
+    same path, and have the same versions of the packages. Needs pip install 'ctmrl[ray]'."""
     engine: Annotated[Literal["fleet", "sb3"] | None, tyro.conf.arg(metavar="fleet|sb3")] = None
     """What trains the behaviour policies: a fleet learns many tasks side by side in one process,
-    sb3 is Stable-Baselines3's SAC, a process a task. By default sb3 for point robots, and a fleet
-    for MuJoCo."""
+    sb3 is Stable-Baselines3's SAC, a process a task. A fleet by default."""
     fleet_size: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Tasks a fleet learns side by side, at most; by default a setting of the budget, and on a GPU
     all of the environment's."""
@@ -104,15 +110,29 @@ def plan_of(config: CollectConfig) -> Plan:
     """
     env = resolve(config.env).name
     wanted = with_engine(budget(env, config.budget, config.episodes), config)
-    tasks = parse_shard(config.shard, parse_tasks(config.tasks, task_set(env)))
+    tasks = parse_tasks(config.tasks, task_set(env))
+    groups = parse_shard(config.shard, wanted.groups(tasks))
     if config.seed < 0:
         raise ValueError(f"--seed must not be negative, got {config.seed}")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    workers = min(cores or 1, MOST_WORKERS) if config.workers is None else config.workers
+    workers = config.workers
+    if workers is None:
+        workers = len(tasks) if config.ray else min(_cores(), MOST_WORKERS)
     if workers < 1:
         raise ValueError(f"--workers must be at least 1, got {workers}")
-    folder = config.out or Path("datasets") / env
-    return Plan(env, tasks, wanted, config.seed, folder, workers, config.device, config.policies)
+    folder, policies = config.out or Path("datasets") / env, config.policies
+    if config.ray:
+        # Processes elsewhere have working folders of their own.
+        folder, policies = folder.absolute(), policies and policies.absolute()
+    return Plan(
+        env, groups, wanted, config.seed, folder, workers, config.device, policies, config.ray
+    )
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def with_engine(budget: Budget, config: CollectConfig) -> Budget:
@@ -122,11 +142,7 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
         ValueError: an option is wrong, or of the other engine.
     """
     fleet = budget.fleet
-    if config.engine == "sb3":
-        fleet = None
-    elif config.engine == "fleet" and fleet is None:
-        fleet = FleetSettings(POINT_FLEET_SIZE, "auto")
-    if fleet is None:
+    if config.engine == "sb3" or fleet is None:
         for name, value, default in (
             ("fleet-size", config.fleet_size, None),
             ("precision", config.precision, "auto"),
@@ -134,7 +150,7 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
             ("policies", config.policies, None),
         ):
             if value != default:
-                raise ValueError(f"--{name} is for fleets: give --engine fleet with it")
+                raise ValueError(f"--{name} is for fleets, not for --engine sb3")
         return replace(budget, fleet=None)
     if config.fleet_size is not None:
         if config.fleet_size < 1:
@@ -145,9 +161,10 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
     # Loads torch, which --help and mistakes need not wait for.
     from datagen.fleet.networks import check_precision
 
-    return replace(
-        budget, fleet=replace(fleet, precision=check_precision(config.precision, config.device))
-    )
+    precision = check_precision(config.precision, config.device)
+    # Of a device such as cuda:1, what decides the bytes.
+    kind = config.device.partition(":")[0]
+    return replace(budget, fleet=replace(fleet, precision=precision, device=kind))
 
 
 def missing_tasks(plan: Plan) -> tuple[int, ...]:
@@ -177,11 +194,16 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
         The index.
 
     Raises:
-        ValueError: the folder cannot be made or written to.
+        ValueError: the folder cannot be made or written to, or there is no Ray.
         DatasetError: a file in the folder is damaged or was collected in another way.
         CollectionError: a worker failed or a file could not be written.
         InterruptedCollectionError: Ctrl-C.
     """
+    with _cluster(plan):
+        return _collect(plan, console)
+
+
+def _collect(plan: Plan, console: Console) -> dict[str, Any]:
     _prepare(plan.folder)
     if plan.policies is not None:
         _prepare(plan.policies, "--policies")
@@ -198,8 +220,8 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
     with CollectionDisplay(console, len(plan.tasks), len(wanted), plan.budget) as display:
         try:
             if plan.budget.fleet:
-                _train(jobs, wanted, plan, display)
-            _run(wanted, plan.workers, display)
+                train_groups(jobs, wanted, plan, display)
+            collect_tasks(wanted, plan, display)
         except KeyboardInterrupt:
             raise InterruptedCollectionError(_done(plan), len(plan.tasks)) from None
         except WorkerError as error:
@@ -211,13 +233,21 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
             remove_stale(plan.folder)
     try:
         index = write_summary(plan.folder, origin(plan.env, plan.budget, plan.seed))
-        for group in plan.groups:
-            group_file(plan.folder, group).unlink(missing_ok=True)
+        remove_states(plan.folder)
         return index
     except OSError as error:
         raise CollectionError(
             f"all tasks are done, but not the index ({error}); the same command continues"
         ) from error
+
+
+def _cluster(plan: Plan) -> AbstractContextManager[None]:
+    """The connection to Ray, where it is asked for."""
+    if plan.ray is None:
+        return nullcontext()
+    from datagen.ray_jobs import connected
+
+    return connected(plan.ray)
 
 
 def _done(plan: Plan) -> int:
@@ -237,70 +267,6 @@ def _prepare(folder: Path, option: str = "--out") -> None:
     remove_stale(folder)
 
 
-def _train(
-    jobs: Sequence[Job], wanted: Sequence[Job], plan: Plan, display: CollectionDisplay
-) -> None:
-    """Train the groups of all wanted tasks, as far as that has not been done.
-
-    Raises:
-        DatasetError: the file of a group is damaged or of another training.
-        WorkerError: a group could not be trained.
-    """
-    from datagen.fleet.training import FleetJob, check_group, train_fleet
-
-    groups = {job.group for job in wanted}
-    fleets = [
-        FleetJob(tuple(job for job in jobs if job.group == group), plan.device)
-        for group in plan.groups
-        if group in groups
-    ]
-    for fleet in fleets:
-        check_group(fleet)
-    missing = {job.task for job in wanted}
-    for fleet, event in _events(train_fleet, fleets, plan.workers):
-        # Some of a group may be finished, where a file of it was lost.
-        tasks = tuple(task for task in fleet.tasks if task in missing)
-        if event.kind == "started":
-            display.started(tasks)
-        elif event.kind == "done":
-            display.trained(tasks)
-        elif isinstance(event.value, int):
-            display.step(tasks, event.value)
-
-
-def _run(jobs: Sequence[Job], workers: int, display: CollectionDisplay) -> None:
-    for job, event in _events(collect_task, jobs, workers):
-        if event.kind == "started":
-            display.started(job.tasks)
-        elif isinstance(event.value, int):
-            display.step(job.tasks, event.value)
-        elif event.value is not None:
-            display.done(job.task, event.value)
-
-
-class _HasTasks(Protocol):
-    @property
-    def tasks(self) -> tuple[int, ...]: ...
-
-
-J = TypeVar("J", bound=_HasTasks)
-R = TypeVar("R")
-
-
-def _events(
-    work: Callable[[J, Callable[[int], None]], R], jobs: Sequence[J], workers: int
-) -> Iterator[tuple[J, Event[R]]]:
-    """Run jobs on workers; each event with its job, and a failure with its tasks' numbers."""
-    try:
-        with closing(run_jobs(work, jobs, workers)) as events:
-            for event in events:
-                yield jobs[event.index], event
-    except WorkerError as error:
-        where = rows_text(jobs[error.index].tasks)
-        noun = "task" if len(jobs[error.index].tasks) == 1 else "tasks"
-        raise WorkerError(error.index, f"{noun} {where}: {error}") from None
-
-
 def describe(plan: Plan, console: Console) -> None:
     """Print what a plan would do and about how long it would take; touches nothing.
 
@@ -313,6 +279,7 @@ def describe(plan: Plan, console: Console) -> None:
     lines = {
         "dataset": f"{plan.folder}, budget {budget.name}, seed {plan.seed}",
         "tasks": f"{rows_text(plan.tasks)} ({len(plan.tasks)} tasks, {len(missing)} to collect)",
+        **({"groups": _groups_text(plan.groups)} if budget.fleet else {}),
         "training": f"{marks[-1]:,} steps a task, the first {budget.random_steps:,} random",
         "checkpoints": f"{len(marks)}, from {marks[0]:,} to {marks[-1]:,} steps",
         "episodes": f"{budget.episodes} each checkpoint, {budget.total_episodes:,} a task",
@@ -323,6 +290,12 @@ def describe(plan: Plan, console: Console) -> None:
     if missing:
         time = duration(seconds_of(plan, missing))
         _say(console, f"{'time:':13}about {time} with {_count(plan.workers, 'worker')}")
+
+
+def _groups_text(groups: Sequence[tuple[int, ...]]) -> str:
+    """How many groups of how many tasks; their sizes differ by one at most."""
+    sizes = sorted({len(group) for group in groups})
+    return f"{len(groups)} of {' or '.join(map(str, sizes))} {'task' if sizes == [1] else 'tasks'}"
 
 
 def _count(number: int, noun: str) -> str:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from datagen.card import CARD_FILE, card
-from datagen.dataset import DatasetError, task_of, write_index
+from datagen.dataset import DatasetError, task_file, task_of, write_index
 from datagen.files import digest, read_bytes, write_whole
+from datagen.job import STATE_FILES
 from datagen.task_files import parse_task
 
 _PARTIAL = re.compile(r"\..+\.(\d+)\.partial")
@@ -121,6 +122,23 @@ def remove_stale(folder: Path) -> None:
     for path in folder.iterdir():
         match = _PARTIAL.fullmatch(path.name)
         if match and not _alive(int(match[1])):
+            path.unlink(missing_ok=True)
+
+
+def remove_states(folder: Path) -> None:
+    """Delete the files of fleets' trainings whose tasks all have a file by now.
+
+    One with a task that has none stays: another shard trains it, or it was interrupted.
+    """
+    paths = list(folder.glob(STATE_FILES))
+    if not paths:
+        return
+    # Loads torch.
+    from datagen.fleet.state import group_of
+
+    for path in paths:
+        group = group_of(path)
+        if group and all((folder / task_file(task)).exists() for task in group):
             path.unlink(missing_ok=True)
 
 

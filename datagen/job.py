@@ -64,8 +64,12 @@ class Job:
         return int(self.stream(purpose).generate_state(1)[0])
 
 
+STATE_FILES = ".fleet_*.safetensors"
+"""What the names of `group_file` are like, for `Path.glob`."""
+
+
 def group_file(folder: Path, group: tuple[int, ...]) -> Path:
-    """The file of a group's training; it is no part of the dataset and goes when that is done."""
+    """The file of a group's training, no part of the dataset; it goes when its tasks are done."""
     name = digest(",".join(map(str, group)))[:8]
     return folder / f".fleet_{group[0]:03d}-{group[-1]:03d}_{name}.safetensors"
 

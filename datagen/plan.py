@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from datagen.budgets import Budget, groups_of
+from datagen.budgets import Budget
 from datagen.columns import COLUMNS
 from meta_envs import TaskSet, resolve
 from meta_envs.registry import definition
@@ -22,28 +22,31 @@ class Plan:
 
     Attributes:
         env: short name of the environment.
-        tasks: rows of its task set to have in the end, rising.
+        groups: rows of its task set to have in the end, rising; those of a group are trained side
+            by side.
         budget: how much of each.
         seed: of the dataset.
         folder: the dataset's.
         workers: processes at most.
         device: where a fleet learns, torch's name for it.
         policies: folder for a fleet's last policies as files of Stable-Baselines3's, or None.
+        ray: address of the Ray cluster that does the work, or None for processes of this machine.
     """
 
     env: str
-    tasks: tuple[int, ...]
+    groups: tuple[tuple[int, ...], ...]
     budget: Budget
     seed: int
     folder: Path
     workers: int
     device: str = "cpu"
     policies: Path | None = None
+    ray: str | None = None
 
     @property
-    def groups(self) -> tuple[tuple[int, ...], ...]:
-        """The tasks in groups that are trained side by side; each alone without a fleet."""
-        return groups_of(self.tasks, self.budget.fleet.size if self.budget.fleet else 1)
+    def tasks(self) -> tuple[int, ...]:
+        """The tasks of all groups."""
+        return tuple(task for group in self.groups for task in group)
 
     @property
     def rows(self) -> int:
@@ -87,18 +90,23 @@ def parse_tasks(text: str | None, tasks: TaskSet) -> tuple[int, ...]:
     return tuple(sorted(rows))
 
 
-def parse_shard(text: str | None, tasks: Sequence[int]) -> tuple[int, ...]:
-    """The tasks of shard `i/n`, every n-th from the i-th on; all of them for None.
+def parse_shard(text: str | None, groups: Sequence[tuple[int, ...]]) -> tuple[tuple[int, ...], ...]:
+    """The groups of shard `i/n`, every n-th from the i-th on; all of them for None.
+
+    Groups stay whole, so that the shards together make the bytes that one collection makes.
 
     Raises:
         ValueError: the text is something else, i is not below n, or the shard is empty.
     """
     if text is None:
-        return tuple(tasks)
+        return tuple(groups)
     match = _SHARD.fullmatch(text.strip())
     index, count = (int(match[1]), int(match[2])) if match else (0, 0)
     if index >= count:
         raise ValueError(f"--shard takes i/n with i from 0 to n - 1, such as 0/8, got '{text}'")
-    if index >= len(tasks):
-        raise ValueError(f"--shard {text} of {len(tasks)} tasks is empty, take n <= {len(tasks)}")
-    return tuple(tasks[index::count])
+    if index >= len(groups):
+        raise ValueError(
+            f"--shard {text} is empty: there are {len(groups)} groups of tasks, "
+            f"take n <= {len(groups)}"
+        )
+    return tuple(groups[index::count])

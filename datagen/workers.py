@@ -189,14 +189,25 @@ def _serve(work: Work[Any, Any], connection: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
-            answer = ("done", work(job, lambda step: connection.send(("step", step))))
+            connection.send(answer(work, job, lambda step: connection.send(("step", step))))
         except BrokenPipeError:
             return
-        except (OSError, ValueError) as error:
-            answer = ("failed", str(error))
-        except Exception:
-            answer = ("failed", f"an error in the program\n{traceback.format_exc()}")
-        connection.send(answer)
+
+
+def answer(work: Work[J, R], job: J, report: Report) -> tuple[str, R | str]:
+    """Do a job: "done" and its result, or "failed" and why, as a sentence.
+
+    Raises:
+        BrokenPipeError: there is nobody to report to any more.
+    """
+    try:
+        return "done", work(job, report)
+    except BrokenPipeError:
+        raise
+    except (OSError, ValueError) as error:
+        return "failed", str(error)
+    except Exception:
+        return "failed", f"an error in the program\n{traceback.format_exc()}"
 
 
 def _die_with_parent() -> None:

@@ -23,7 +23,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "meta_envs.__main__": {"meta_envs", *COMMAND_LINE},
     "meta_envs.commands": {"meta_envs", "numpy", "PIL", *COMMAND_LINE},
     "datagen": {
-        "datagen", "meta_envs", "gymnasium", "h5py", "matplotlib", "minari", "numpy", "PIL",
+        "datagen", "meta_envs", "gymnasium", "h5py", "matplotlib", "minari", "numpy", "PIL", "ray",
         "safetensors", "stable_baselines3", "torch", *COMMAND_LINE,
     },
     "ctmrl": {

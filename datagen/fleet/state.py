@@ -65,6 +65,16 @@ def load_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, about
 
 
+def group_of(path: Path) -> tuple[int, ...]:
+    """The tasks of a group's file, without reading its tensors; none where it does not say."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = parse_canonical((file.metadata() or {})[_ABOUT].encode())
+        return tuple(map(int, about["origin"]["group"]))
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+        return ()
+
+
 def _digest(tensors: Mapping[str, Tensor], about: Mapping[str, Any]) -> str:
     """SHA-256 of tensors, which are the processor's, and of what is said about them."""
     total = hashlib.sha256(canonical_json(about).encode())

@@ -31,7 +31,8 @@ def test_every_environment_has_the_three_budgets(env: str) -> None:
         assert row.name == name
         # Checkpoints fall between two bursts of updates, so that each policy has had updates.
         assert row.checkpoints[0] - row.random_steps >= 2 * row.sac.update_every
-        assert (row.fleet is not None) == (env in MUJOCO_ROBOTS)
+        assert row.fleet is not None
+        assert row.fleet.precision == "auto"
 
 
 def test_config_is_json_and_has_every_number() -> None:
@@ -47,9 +48,9 @@ def test_config_is_json_and_has_every_number() -> None:
 
 
 def test_config_names_the_fleet_only_where_there_is_one() -> None:
-    assert "fleet" not in budget("point_robot", "paper").config()
+    assert "fleet" not in replace(budget("point_robot", "paper"), fleet=None).config()
     config = budget("hopper_params", "smoke").config()
-    assert config["fleet"] == {"size": 25, "precision": "auto"}
+    assert config["fleet"] == {"size": 25, "precision": "auto", "device": "cpu"}
     assert json.loads(json.dumps(config)) == config
     with pytest.raises(ValueError, match="a fleet has at least 1 task, got 0"):
         FleetSettings(0, "float32")
@@ -58,13 +59,9 @@ def test_config_names_the_fleet_only_where_there_is_one() -> None:
 @pytest.mark.parametrize(
     ("env", "fleet", "options"),
     [
-        ("point_robot", None, []),
-        ("point_robot", FleetSettings(50, "float32"), ["--engine", "fleet"]),
-        (
-            "point_robot",
-            FleetSettings(4, "float32"),
-            ["--engine", "fleet", "--fleet-size", "4"],
-        ),
+        ("point_robot", None, ["--engine", "sb3"]),
+        ("point_robot", FleetSettings(50, "float32"), []),
+        ("point_robot", FleetSettings(4, "float32"), ["--fleet-size", "4"]),
         ("ant-goal", None, ["--engine", "sb3"]),
         ("ant-goal", FleetSettings(25, "bfloat16"), []),
         ("ant-goal", FleetSettings(4, "float32"), ["--fleet-size", "4"]),
@@ -77,6 +74,9 @@ def test_options_that_a_budget_alone_does_not_say(
     precision = ["--precision", fleet.precision] if fleet else []
     config = replace(budget(env, "smoke"), fleet=fleet).config()
     assert other_options(env, "smoke", config) == [*options, *precision]
+    if fleet:
+        other = replace(budget(env, "smoke"), fleet=replace(fleet, device="cuda")).config()
+        assert other_options(env, "smoke", other) == [*options, *precision, "--device", "cuda"]
     config["episodes"] = 13
     assert other_options(env, "smoke", config) == ["--episodes", "13", *options, *precision]
 

@@ -24,7 +24,7 @@ def index(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The index of four tasks, of which task 2 is a test task."""
     env, tasks = "point_robot_wind", (0, 1, 2, 3)
     folder = write_dataset(tmp_path_factory.mktemp("card"), tasks, env)
-    made = origin(env, budget(env, "smoke"), 0)
+    made = origin(env, replace(budget(env, "smoke"), fleet=None), 0)
     return {**made, "tasks": index_of(folder, env, tasks, 4, 0)["tasks"]}
 
 
@@ -77,11 +77,11 @@ def test_rows_text(tasks: list[int], text: str) -> None:
 
 def test_the_command_has_what_differs_from_the_defaults(index: dict[str, Any]) -> None:
     start = "python -m datagen.collect --env point_robot_wind --budget smoke"
-    assert remake_command(index) == f"{start} --tasks 0-3 --seed 0"
+    assert remake_command(index) == f"{start} --engine sb3 --tasks 0-3 --seed 0"
     every = [{"task": task} for task in range(50)]
-    assert remake_command({**index, "tasks": every, "seed": 4}) == f"{start} --seed 4"
+    assert remake_command({**index, "tasks": every, "seed": 4}) == f"{start} --engine sb3 --seed 4"
     thin = {**index, "tasks": every, "config": {**index["config"], "episodes": 12}}
-    assert remake_command(thin) == f"{start} --episodes 12 --seed 0"
+    assert remake_command(thin) == f"{start} --episodes 12 --engine sb3 --seed 0"
 
 
 def fleet_index(env: str, fleet: FleetSettings | None) -> dict[str, Any]:
@@ -93,13 +93,9 @@ def fleet_index(env: str, fleet: FleetSettings | None) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("env", "fleet", "options"),
     [
-        ("point_robot_wind", None, ""),
-        ("point_robot_wind", FleetSettings(50, "float32"), "--engine fleet --precision float32 "),
-        (
-            "point_robot_wind",
-            FleetSettings(7, "bfloat16"),
-            "--engine fleet --fleet-size 7 --precision bfloat16 ",
-        ),
+        ("point_robot_wind", None, "--engine sb3 "),
+        ("point_robot_wind", FleetSettings(50, "float32"), "--precision float32 "),
+        ("point_robot_wind", FleetSettings(7, "bfloat16"), "--fleet-size 7 --precision bfloat16 "),
         ("hopper_params", FleetSettings(25, "bfloat16"), "--precision bfloat16 "),
         ("hopper_params", FleetSettings(3, "float32"), "--fleet-size 3 --precision float32 "),
         ("hopper_params", None, "--engine sb3 "),
@@ -117,9 +113,9 @@ def test_the_command_says_how_the_policies_were_trained(
 
 
 def test_a_fleets_settings_are_in_the_card(index: dict[str, Any]) -> None:
-    config = {**index["config"], "fleet": {"size": 1500, "precision": "float32"}}
+    config = {**index["config"], "fleet": {"size": 1500, "precision": "float32", "device": "cpu"}}
     text = card({**index, "config": config})
-    assert "| `fleet` | precision float32, size 1,500 |\n" in text
+    assert "| `fleet` | device cpu, precision float32, size 1,500 |\n" in text
     assert card(json.loads(json.dumps({**index, "config": config}, sort_keys=True))) == text
 
 

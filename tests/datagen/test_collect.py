@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,9 @@ from datagen.job import Job, origin
 
 Capture = pytest.CaptureFixture[str]
 TASKS = range(8)
-ARGUMENTS = ("--env", "point_robot_wind", "--budget", "smoke", "--seed", "5", "--tasks", "0-7")
+ROBOTS = ("--env", "point_robot_wind", "--budget", "smoke", "--seed", "5", "--tasks", "0-7")
+ARGUMENTS = (*ROBOTS, "--engine", "sb3")
+SMOKE = replace(budget("point_robot_wind", "smoke"), fleet=None)
 # Ctrl-C is ignored by programs that a shell starts in the background, and by their children.
 PROGRAM = (
     "import signal, sys\n"
@@ -89,14 +92,14 @@ def test_it_makes_an_intact_dataset_with_a_card(original: Path, capsys: Capture)
     assert said.err == "", "a warning would name a file that does not belong there"
     dataset = open_dataset(original)
     assert dataset.tasks.tolist() == list(TASKS)
-    assert dataset.index["config"] == budget("point_robot_wind", "smoke").config()
+    assert dataset.index["config"] == SMOKE.config()
     card = (original / "README.md").read_text()
-    assert "--env point_robot_wind --budget smoke --tasks 0-7 --seed 5\n" in card
+    assert "--env point_robot_wind --budget smoke --engine sb3 --tasks 0-7 --seed 5\n" in card
 
 
 def test_a_file_does_not_depend_on_what_else_ran(original: Path, tmp_path: Path) -> None:
     # Task 7 alone in this very process, the fixture's in workers that did others before.
-    job = Job("point_robot_wind", 7, budget("point_robot_wind", "smoke"), 5, tmp_path)
+    job = Job("point_robot_wind", 7, SMOKE, 5, tmp_path)
     collect_task(job)
     assert (tmp_path / "task_007.h5").read_bytes() == (original / "task_007.h5").read_bytes()
 
@@ -176,7 +179,7 @@ def test_a_damaged_file_is_named(folder: Path, capsys: Capture) -> None:
         (["--tasks", "3-"], "--tasks takes numbers and ranges such as 0-9,12, got '3-'"),
         (["--tasks", "49-50"], "has tasks 0 to 49, got '49-50'"),
         (["--shard", "2/2"], "--shard takes i/n with i from 0 to n - 1"),
-        (["--shard", "8/9"], "--shard 8/9 of 8 tasks is empty"),
+        (["--shard", "8/9"], "--shard 8/9 is empty: there are 8 groups of tasks"),
         (["--seed", "-1"], "--seed must not be negative, got -1"),
         (["--workers", "0"], "--workers must be at least 1, got 0"),
         (["--episodes", "0"], "episodes must be at least 1, got 0"),
@@ -219,7 +222,13 @@ def test_a_dry_run_touches_nothing(
     assert lines[-2].endswith("at most 1,600 rows, 0.1 MB")
     assert re.fullmatch(r"time: +about \d+ s with 1 worker", lines[-1])
     assert contents(folder) == before
-    assert main([*ARGUMENTS, "--out", str(folder / "new"), "--dry-run"]) == 0
+    fleet = ("--fleet-size", "3", "--out", str(folder / "new"), "--dry-run")
+    assert main([*ROBOTS, *fleet, "--shard", "0/2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1:3] == [
+        "tasks:       0-1,5-7 (5 tasks, 5 to collect)",
+        "groups:      2 of 2 or 3 tasks",
+    ]
     assert not (folder / "new").exists()
 
 

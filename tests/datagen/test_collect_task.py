@@ -17,7 +17,7 @@ from meta_envs import reference_returns, task_set
 
 ENV = "sparse_point_robot"
 TASK = 2
-JOB = Job(ENV, TASK, budget(ENV, "smoke"), 7, Path())
+JOB = Job(ENV, TASK, replace(budget(ENV, "smoke"), fleet=None), 7, Path())
 
 
 @pytest.fixture(scope="module")

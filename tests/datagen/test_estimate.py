@@ -36,8 +36,8 @@ def test_a_rollout_is_measured() -> None:
 def test_the_estimate_is_in_proportion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(estimate, "seconds_a_learning_step", lambda env, budget: 0.01)
     monkeypatch.setattr(estimate, "seconds_a_rollout", lambda env, episodes: 0.5)
-    paper = budget("point_robot", "paper")
-    plan = Plan("point_robot", tuple(range(5)), paper, 0, tmp_path, workers=2)
+    paper = dataclasses.replace(budget("point_robot", "paper"), fleet=None)
+    plan = Plan("point_robot", paper.groups(range(5)), paper, 0, tmp_path, workers=2)
     task = 2800 * 0.01 + 14 * 0.5
     assert seconds_of(plan, plan.tasks) == pytest.approx(START_SECONDS + 3 * task)
     assert seconds_of(plan, (1, 4)) == pytest.approx(START_SECONDS + task)
@@ -51,7 +51,7 @@ def test_a_step_of_a_fleet_is_measured_on_one_thread(
     monkeypatch.setattr(estimate, "MEASURED_SECONDS", 0.2)
     fleet = FleetSettings(2, "float32")
     rows = dataclasses.replace(budget("point_robot", "smoke"), fleet=fleet)
-    plan = Plan("point_robot", (0, 1, 2), rows, 0, tmp_path, workers=1)
+    plan = Plan("point_robot", ((0, 1), (2,)), rows, 0, tmp_path, workers=1)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -70,7 +70,7 @@ def test_a_fleets_estimate_is_in_proportion(
     monkeypatch.setattr(estimate, "seconds_a_fleet_step", lambda plan: 0.01)
     monkeypatch.setattr(estimate, "seconds_a_rollout", lambda env, episodes: 0.5)
     rows = budget("hopper_params", "smoke")
-    plan = Plan("hopper_params", tuple(range(60)), rows, 0, tmp_path, workers=2)
+    plan = Plan("hopper_params", rows.groups(range(60)), rows, 0, tmp_path, workers=2)
     # Three groups of 20 on two workers are two rounds; then 30 tasks a worker are rolled out.
     every = seconds_of(plan, plan.tasks)
     assert every == pytest.approx(START_SECONDS + 2 * 200 * 0.01 + 30 * 2 * 0.5)

@@ -155,7 +155,7 @@ def test_the_remedy_is_a_command_that_shells_understand() -> None:
         "python -m datagen.collect --env point_robot_wind --tasks 7 --budget smoke --seed 3 --out"
     )
     thinned = collect_command(folder, {"budget": "smoke", "seed": 3, "config": {"episodes": 7}})
-    assert "--seed 3 --episodes 7 --out" in thinned
+    assert "--seed 3 --episodes 7 --engine sb3 --out" in thinned
     own = {
         "budget": "smoke",
         "seed": 3,
@@ -175,10 +175,9 @@ def test_the_remedy_says_how_the_policies_were_trained() -> None:
         return command.removesuffix(" --out data").rpartition("--seed 3")[2]
 
     robot, hopper = "point_robot_wind", "hopper_params"
-    both = " --engine fleet --precision float32"
-    assert options(robot, None, {}) == ""
-    assert options(hopper, None, {}) == " --engine sb3"
-    assert options(robot, FleetSettings(50, "float32"), {}) == both
+    assert options(robot, None, {}) == options(hopper, None, {}) == " --engine sb3"
+    assert options(robot, FleetSettings(50, "float32"), {}) == " --precision float32"
+    assert options(robot, FleetSettings(50, "float32", "cuda"), {}).endswith(" --device cuda")
     assert options(hopper, FleetSettings(25, "bfloat16"), {}) == " --precision bfloat16"
     thin = options(hopper, FleetSettings(9, "float32"), {"episodes": 1})
     assert thin == " --episodes 1 --fleet-size 9 --precision float32"
@@ -211,7 +210,7 @@ def test_errors_survive_the_way_from_a_worker_process() -> None:
 
 
 def test_a_task_of_a_fleet_is_collected_again_in_its_group() -> None:
-    config = {"episodes": 2, "fleet": {"size": 3, "precision": "float32"}}
+    config = {"episodes": 2, "fleet": {"size": 3, "precision": "float32", "device": "cpu"}}
     index = {
         "env": "hopper_params",
         "budget": "smoke",

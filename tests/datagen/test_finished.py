@@ -14,8 +14,9 @@ import pytest
 from datagen import finished
 from datagen.budgets import budget
 from datagen.dataset import DatasetError, TaskData, open_dataset, task_file, write_index, write_task
-from datagen.finished import remove_stale, scan, without_versions, write_summary
-from datagen.job import origin
+from datagen.finished import remove_stale, remove_states, scan, without_versions, write_summary
+from datagen.fleet.state import save_state
+from datagen.job import group_file, origin
 from tests.datagen.examples import task_data
 
 ENV = "point_robot_wind"
@@ -60,6 +61,15 @@ def test_finished_tasks_are_found_in_order(tmp_path: Path) -> None:
             r"was collected with config\.beta 1, not nothing of that name; ",
         ),
         (
+            {
+                "config": {
+                    **ORIGIN["config"],
+                    "fleet": {**ORIGIN["config"]["fleet"], "device": "cuda"},
+                }
+            },
+            r"was collected with config\.fleet\.device 'cuda', not 'cpu'; ",
+        ),
+        (
             {"versions": {**ORIGIN["versions"], "torch": "1.0"}},
             r"was collected with versions\.torch '1\.0', not '",
         ),
@@ -97,6 +107,18 @@ def test_what_dead_writers_left_is_removed(tmp_path: Path) -> None:
         path.write_text("half")
     remove_stale(tmp_path)
     assert [path.exists() for path in (stale, living, other)] == [False, True, True]
+
+
+def test_trainings_of_finished_tasks_are_removed(tmp_path: Path) -> None:
+    put(tmp_path, 1)
+    put(tmp_path, 2)
+    done, also, half = (group_file(tmp_path, group) for group in ((1,), (1, 2), (2, 3)))
+    for path, group in ((done, [1]), (also, [1, 2]), (half, [2, 3])):
+        save_state(path, {}, {"origin": {"group": group}})
+    damaged = group_file(tmp_path, (2,))
+    damaged.write_text("x")
+    remove_states(tmp_path)
+    assert [path.exists() for path in (done, also, half, damaged)] == [False, False, True, True]
 
 
 def test_the_summary_is_a_dataset_with_a_card(tmp_path: Path) -> None:

@@ -41,22 +41,23 @@ def test_tasks_out_of_range(text: str) -> None:
         parse_tasks(text, task_set("point_robot_wind"))
 
 
-def test_shards_share_the_tasks_out() -> None:
-    tasks = (0, 1, 2, 5, 6, 7, 8)
-    shards = [parse_shard(f"{i}/3", tasks) for i in range(3)]
-    assert shards == [(0, 5, 8), (1, 6), (2, 7)]
-    assert parse_shard(None, tasks) == parse_shard("0/1", tasks) == tasks
+def test_shards_share_whole_groups_out() -> None:
+    groups = ((0, 1), (2,), (5, 6), (7, 8), (9,))
+    shards = [parse_shard(f"{i}/3", groups) for i in range(3)]
+    assert shards == [((0, 1), (7, 8)), ((2,), (9,)), ((5, 6),)]
+    assert parse_shard(None, groups) == parse_shard("0/1", groups) == groups
 
 
 @pytest.mark.parametrize("text", ["3/3", "0/0", "1", "a/b", "-1/2", "1/2/3", ""])
 def test_a_text_that_is_no_shard(text: str) -> None:
     with pytest.raises(ValueError, match="--shard takes i/n with i from 0 to n - 1"):
-        parse_shard(text, (1, 2, 3))
+        parse_shard(text, ((1,), (2,), (3,)))
 
 
 def test_an_empty_shard() -> None:
-    with pytest.raises(ValueError, match="--shard 3/4 of 3 tasks is empty"):
-        parse_shard("3/4", (1, 2, 3))
+    sentence = "--shard 2/3 is empty: there are 2 groups of tasks, take n <= 2"
+    with pytest.raises(ValueError, match=sentence):
+        parse_shard("2/3", ((1, 2), (3,)))
 
 
 @pytest.mark.parametrize(
@@ -74,19 +75,19 @@ def test_an_empty_shard() -> None:
 def test_groups_are_of_about_one_size(count: int, size: int, sizes: list[int]) -> None:
     tasks = tuple(range(2, 2 * count + 2, 2))
     rows = replace(budget("hopper_params", "smoke"), fleet=FleetSettings(size, "float32"))
-    groups = Plan("hopper_params", tasks, rows, 0, Path(), 1).groups
+    groups = rows.groups(tasks)
     assert [len(group) for group in groups] == sizes
-    assert tuple(task for group in groups for task in group) == tasks
+    assert Plan("hopper_params", groups, rows, 0, Path(), 1).tasks == tasks
 
 
 def test_without_a_fleet_each_task_is_alone() -> None:
-    plan = Plan("point_robot", (1, 4, 6), budget("point_robot", "smoke"), 0, Path(), 1)
-    assert plan.groups == ((1,), (4,), (6,))
+    alone = replace(budget("point_robot", "smoke"), fleet=None)
+    assert alone.groups((1, 4, 6)) == ((1,), (4,), (6,))
 
 
 @pytest.mark.parametrize("env", ["point_robot_wind", "sparse_point_robot"])
 def test_rows_and_bytes_are_those_of_a_file(env: str, tmp_path: Path) -> None:
-    plan = Plan(env, (0, 1), budget(env, "smoke"), 0, tmp_path, 1)
+    plan = Plan(env, ((0, 1),), budget(env, "smoke"), 0, tmp_path, 1)
     assert plan.rows == 4 * 2 * {"point_robot_wind": 25, "sparse_point_robot": 20}[env]
     sizes = []
     for episodes in (40, 400):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -11,7 +12,7 @@ from rich.console import Console
 from datagen.budgets import budget
 from datagen.progress import CollectionDisplay, TimeLeft, duration
 
-PAPER = budget("point_robot", "paper")
+PAPER = replace(budget("point_robot", "paper"), fleet=None)
 RETURNS = {"random": -28.8, "expert": -5.1, "behavior": {"4800": -6.914}, "deterministic": {}}
 
 

@@ -26,6 +26,7 @@ from datagen.card import remake_command
 from datagen.collect import CollectConfig, main, plan_of
 from datagen.dataset import open_dataset
 from datagen.fleet.networks import best_precision
+from datagen.fleet.state import save_state
 from datagen.job import group_file
 from datagen.plan import Plan
 from meta_envs import MetaVectorEnv
@@ -33,6 +34,8 @@ from meta_envs import MetaVectorEnv
 Capture = pytest.CaptureFixture[str]
 HOPPERS = ("--env", "hopper_params", "--budget", "smoke", "--tasks", "0-2", "--workers", "1")
 ROBOTS = ("--env", "point_robot_wind", "--budget", "smoke", "--tasks", "0-1", "--workers", "1")
+PAIRS = (*HOPPERS, "--fleet-size", "2")
+SB3 = (*HOPPERS, "--engine", "sb3")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -58,7 +61,11 @@ def test_it_makes_an_intact_dataset(hoppers: Path, capsys: Capture) -> None:
 
 def test_the_data_are_those_of_the_budget(hoppers: Path) -> None:
     dataset = open_dataset(hoppers)
-    assert dataset.index["config"]["fleet"] == {"size": 25, "precision": best_precision()}
+    assert dataset.index["config"]["fleet"] == {
+        "size": 25,
+        "precision": best_precision(),
+        "device": "cpu",
+    }
     for task in range(3):
         data = dataset.read(task)
         ends = np.flatnonzero(np.diff(data.episode, append=-1))
@@ -81,7 +88,6 @@ def test_a_second_run_does_nothing(hoppers: Path, tmp_path: Path, capsys: Captur
     assert contents(folder) == contents(hoppers)
 
 
-# The fast tests of test_collect.py collect with sb3 already, the default for these robots.
 def test_policies_are_kept_where_asked(hoppers: Path, tmp_path: Path) -> None:
     out, kept = tmp_path / "data", tmp_path / "policies"
     assert main([*HOPPERS, "--out", str(out), "--policies", str(kept)]) == 0
@@ -106,7 +112,7 @@ def test_either_engine_collects_point_robots(engine: str, tmp_path: Path, capsys
     assert main([*ROBOTS, "--engine", engine, *options, "--out", str(tmp_path)]) == 0
     dataset = open_dataset(tmp_path)
     assert dataset.tasks.tolist() == ([0, 1] if engine == "fleet" else [0])
-    fleet = {"size": 50, "precision": "float32"} if engine == "fleet" else None
+    fleet = {"size": 50, "precision": "float32", "device": "cpu"} if engine == "fleet" else None
     assert dataset.index["config"].get("fleet") == fleet
     assert len(dataset.read(0)) == 2 * 4 * 25
     assert check.main([str(tmp_path)]) == 0
@@ -122,11 +128,10 @@ def test_the_default_engines() -> None:
     def asked(env: str, engine: Literal["fleet", "sb3"] | None = None) -> Plan:
         return plan_of(CollectConfig(env, "smoke", engine=engine))
 
-    assert asked("point_robot_wind", "sb3") == asked("point_robot_wind")
-    assert asked("hopper_params", "fleet") == asked("hopper_params")
-    assert asked("hopper_params", "sb3").budget.fleet is None
-    fleet = asked("point_robot_wind", "fleet").budget.fleet
-    assert fleet == FleetSettings(50, best_precision())
+    for env, size in (("point_robot_wind", 50), ("hopper_params", 25)):
+        assert asked(env, "fleet") == asked(env)
+        assert asked(env).budget.fleet == FleetSettings(size, best_precision())
+        assert asked(env, "sb3").budget.fleet is None
 
 
 @pytest.mark.parametrize("device", ["cuda", "cuda:1"])
@@ -147,13 +152,10 @@ def test_a_gpu_has_all_tasks_at_once(device: str, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((*ROBOTS, "--precision", "float32"), "--precision is for fleets: give --engine fleet"),
-        ((*ROBOTS, "--fleet-size", "3"), "--fleet-size is for fleets: give --engine fleet"),
-        ((*ROBOTS, "--device", "cuda"), "--device is for fleets: give --engine fleet with it"),
-        (
-            (*HOPPERS, "--engine", "sb3", "--precision", "bfloat16"),
-            "--precision is for fleets: give --engine fleet with it",
-        ),
+        ((*SB3, "--precision", "bfloat16"), "--precision is for fleets, not for --engine sb3"),
+        ((*SB3, "--fleet-size", "3"), "--fleet-size is for fleets, not for --engine sb3"),
+        ((*SB3, "--device", "cuda"), "--device is for fleets, not for --engine sb3"),
+        ((*SB3, "--policies", "kept"), "--policies is for fleets, not for --engine sb3"),
         ((*HOPPERS, "--fleet-size", "0"), "--fleet-size must be at least 1, got 0"),
         ((*HOPPERS, "--device", "nonsense"), "--device nonsense cannot be used here: "),
         ((*HOPPERS, "--device", "cuda:99"), "--device cuda:99 cannot be used here: "),
@@ -175,10 +177,53 @@ def test_mistakes_are_one_sentence(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_shards_are_the_groups_of_the_whole(count: int) -> None:
+    def asked(shard: str | None) -> Plan:
+        tasks, size = "0-9,20", 4
+        return plan_of(
+            CollectConfig("ant_goal", "smoke", tasks=tasks, fleet_size=size, shard=shard)
+        )
+
+    shards = [asked(f"{index}/{count}") for index in range(count)]
+    assert sorted(group for shard in shards for group in shard.groups) == list(asked(None).groups)
+
+
+@pytest.mark.slow
+def test_all_shards_together_have_the_same_bytes(tmp_path: Path) -> None:
+    whole, shards = tmp_path / "whole", tmp_path / "shards"
+    assert main([*PAIRS, "--out", str(whole)]) == 0
+    for shard in ("1/2", "0/2"):
+        assert main([*PAIRS, "--shard", shard, "--out", str(shards)]) == 0
+    assert contents(shards) == contents(whole)
+
+
+def test_an_interrupted_collection_of_other_tasks_leaves_nothing(
+    hoppers: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(hoppers, tmp_path / "data")
+    finished, other = group_file(folder, (0, 2)), group_file(folder, (2, 3))
+    for path, group in ((finished, [0, 2]), (other, [2, 3])):
+        save_state(path, {}, {"origin": {"group": group}})
+    assert main([*HOPPERS, "--out", str(folder)]) == 0
+    assert not finished.exists()
+    assert other.exists(), "task 3 has no file: it may be another shard's"
+
+
+def test_another_device_is_another_collection(
+    hoppers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    folder = shutil.copytree(hoppers, tmp_path / "data")
+    monkeypatch.setattr("datagen.fleet.networks.check_precision", lambda *_: best_precision())
+    assert main([*HOPPERS, "--device", "cuda:1", "--out", str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert "was collected with config.fleet.device 'cpu', not 'cuda'; give the same options" in said
+
+
 def test_a_damaged_training_is_one_sentence(tmp_path: Path, capsys: Capture) -> None:
     path = group_file(tmp_path, (0, 1))
     path.write_bytes(b"x" * 1000)
-    assert main([*ROBOTS, "--engine", "fleet", "--out", str(tmp_path)]) == 2
+    assert main([*ROBOTS, "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"{path}: is damaged (")
     assert said.endswith("; delete it to train its tasks again\n")

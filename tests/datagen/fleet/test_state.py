@@ -14,7 +14,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from datagen.files import DatasetError
-from datagen.fleet.state import learner_counts, learner_tensors, load_state, restore, save_state
+from datagen.fleet.state import (
+    group_of,
+    learner_counts,
+    learner_tensors,
+    load_state,
+    restore,
+    save_state,
+)
 from tests.datagen.fleet.fleets import NEVER, SETTINGS, fleet, parameters
 
 ABOUT = {"checkpoint": 40, "origin": {"gamma": 0.97, "name": "ä"}, "state": [2**127 + 1, True]}
@@ -165,3 +172,15 @@ def test_the_state_of_another_learner() -> None:
         again = fleet((0, 1))
         with pytest.raises(ValueError, match=r"^is of another learner \("):
             restore(again, some, said)
+
+
+def test_the_group_is_read_without_the_tensors(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    save_state(path, tensors(), {"origin": {"group": [3, 4, 8]}})
+    content = path.read_bytes()
+    assert group_of(path) == (3, 4, 8)
+    path.write_bytes(content[:100])
+    assert group_of(path) == ()
+    save_state(path, tensors(), {"origin": {}})
+    assert group_of(path) == ()
+    assert group_of(tmp_path / "none") == ()

@@ -200,6 +200,7 @@ def test_a_damaged_file_is_named(
         (0, replace(TINY, sac=replace(TINY.sac, gamma=0.5))),
         (0, replace(TINY, fleet=FleetSettings(2, "bfloat16"))),
         (0, replace(TINY, fleet=FleetSettings(9, "float32"))),
+        (0, replace(TINY, fleet=FleetSettings(2, "float32", "cuda"))),
         (0, replace(TINY, checkpoints=(40, 50))),
     ],
 )
@@ -313,5 +314,6 @@ def test_an_actor_of_any_depth() -> None:
 def test_a_fleets_job_speaks_of_all_its_tasks(tmp_path: Path) -> None:
     group = work(tmp_path)
     assert group.tasks == TASKS
-    assert group.origin["config"]["fleet"] == {"size": 2, "precision": "float32"}
+    fleet = {"size": 2, "precision": "float32", "device": "cpu"}
+    assert group.origin["config"]["fleet"] == fleet
     assert group.jobs[1] == Job("point_robot_wind", 4, TINY, 0, tmp_path, TASKS)
