@@ -2,11 +2,11 @@ r"""Gradient steps of CTMRL's meta-training a second: ours beside `plain_learner
 
     python benchmarks/meta_train_steps.py --out benchmarks/results/meta_train_steps.csv
 
-Whole steps with sampling and optimisers, on random numbers in the shape of the dataset: the field's
-settings on HalfCheetahVel, and those of `python -m ctmrl.train` without an argument; before the
-codebook is placed and with it. One run of one or two threads, and two seeds side by side, one thread
-each, whose rates add up. Sides take turns; a ratio is taken within one turn, so that a busy machine
-slows both sides of it.
+Whole steps with sampling and optimisers, on random numbers in the shape of the dataset: the
+field's settings on HalfCheetahVel, and those of `python -m ctmrl.train` without an argument; before
+the codebook is placed and with it. One run of one or two threads, and two seeds side by side, one
+thread each, whose rates add up. Sides take turns; a ratio is taken within one turn, so that a busy
+machine slows both sides of it.
 """
 
 from __future__ import annotations
@@ -187,9 +187,19 @@ def measure(case: str, codebook: bool, options: Benchmark) -> list[Result]:
                     for _ in range(options.repetitions)
                 ]
             )
-            rates = [round(float(rate), 2) for rate in np.median(turns, axis=0)]
-            ratio = round(float(np.median(turns[:, 0] / turns[:, 1])), 2)
-            results.append(Result(case, codebook, name, options.repetitions, *rates, ratio))
+            ours_rate, plain_rate = np.median(turns, axis=0).round(2).tolist()
+            ratio = float(np.median(turns[:, 0] / turns[:, 1]))
+            results.append(
+                Result(
+                    case,
+                    codebook,
+                    name,
+                    options.repetitions,
+                    ours_rate,
+                    plain_rate,
+                    round(ratio, 2),
+                )
+            )
         return results
 
 

@@ -1,10 +1,10 @@
 """CTMRL's gradient step as one writes it down first: what `meta_train_steps.py` compares with.
 
-Networks, batches and losses are those of `ctmrl`; the means are plain: a Linear module a layer, each
-critic a network of its own, contexts repeated for every transition, numpy columns sampled task by
-task and copied, a backward pass and an Adam for each network. As in the field's code, the actor's
-loss also differentiates the critics' weights, which nobody needs. Of the field's settings it knows
-what CTMRL's paper has: `dual_penalty` is "value", and `metric_weight` is 0.
+Networks, batches and losses are those of `ctmrl`; the means are plain: a Linear module a layer,
+each critic a network of its own, contexts repeated for every transition, numpy columns sampled task
+by task and copied, a backward pass and an Adam for each network. As in the field's code, the
+actor's loss also differentiates the critics' weights, which nobody needs. It knows the settings of
+the source paper alone: `dual_penalty` is "value", and `metric_weight` is 0.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ class Network(nn.Module):
         self.mean, self.std = statistics
         sizes = [len(self.mean) + more, *hidden]
         layers: list[nn.Module] = []
-        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for fan_in, fan_out in pairwise(sizes):
             layers += [nn.Linear(fan_in, fan_out), nn.ReLU()]
         self.net = nn.Sequential(*layers, nn.Linear(sizes[-1], out))
 
@@ -60,7 +61,9 @@ class PlainLearner:
         with_codebook: whether the codebook's losses are used; they are after the warm-up.
     """
 
-    def __init__(self, config: RunConfig, tasks: Sequence[TaskData], statistics: Statistics) -> None:
+    def __init__(
+        self, config: RunConfig, tasks: Sequence[TaskData], statistics: Statistics
+    ) -> None:
         """Build the networks; initial weights come from torch's global generator."""
         assert isinstance(config.context, CTMRLConfig)
         self.training, self.context = config.training, config.context
@@ -111,8 +114,8 @@ class PlainLearner:
                 own = order[k * episodes : (k + 1) * episodes]
                 pool = np.concatenate([np.arange(starts[e], starts[e + 1]) for e in own])
                 rows = self.rng.choice(pool, n)
-                columns = (data.observations, data.actions, data.rewards[:, None])
-                columns += (data.next_observations,)
+                before = [data.observations, data.actions, data.rewards[:, None]]
+                columns = [*before, data.next_observations]
                 drawn.append(np.concatenate([column[rows] for column in columns], axis=1))
         return torch.from_numpy(np.stack([np.stack(drawn) for drawn in sets]))
 
@@ -164,9 +167,7 @@ class PlainLearner:
             for name in names:
                 self.optimizers[name].step()
         value, rate = self.networks["value"], self.actor_critic.target_rate
-        for target, source in zip(
-            self.target_value.parameters(), value.parameters(), strict=True
-        ):
+        for target, source in zip(self.target_value.parameters(), value.parameters(), strict=True):
             target.data.copy_((1 - rate) * target.data + rate * source.data)
         return losses
 
@@ -190,7 +191,7 @@ class PlainLearner:
             return losses
         matched = functional.cosine_similarity(z[:, None], self.codes[None], dim=-1).argmax(dim=1)
         with torch.no_grad():
-            for code in matched.unique():
+            for code in set(matched.tolist()):
                 mean = z[matched == code].mean(dim=0)
                 eta = self.context.eta
                 self.codes[code] = (1 - eta) * self.codes[code] + eta * mean
@@ -212,7 +213,8 @@ class PlainLearner:
         change = (next_obs - obs - mean[1:]) / std[1:]
         state_error = self.networks["state"](obs, action, repeated) - change
         norms = [(e.square().sum(-1) + 1e-12).sqrt().sum(-1) for e in (reward_error, state_error)]
-        return (norms[0] + norms[1]).mean()
+        loss: Tensor = (norms[0] + norms[1]).mean()
+        return loss
 
     def contrast_loss(self, z: Tensor, other: Tensor, matched: Tensor) -> Tensor:
         """Equation (10), task by task."""
@@ -274,6 +276,7 @@ class PlainLearner:
         penalty = 5 * ((1e-8 + between.square()).sqrt() - 1).clamp_min(0).square().mean()
         loss = penalty - self.divergence(obs, action, drawn, z).mean()
         self.optimizers["dual"].zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         self.optimizers["dual"].step()
-        return loss.detach()
+        detached: Tensor = loss.detach()
+        return detached

@@ -18,19 +18,19 @@ class SyntheticDataset(Dataset):
     Attributes:
         sizes: of an observation and of an action.
         horizon: steps of each episode.
-        episodes: of each task.
+        episode_count: of each task.
         seed: of all numbers.
     """
 
     sizes: tuple[int, int]
     horizon: int
-    episodes: int
+    episode_count: int
     seed: int
 
     def read(self, task: int) -> TaskData:
         """The task's data: normal observations and rewards, uniform actions, no real end."""
         draw = np.random.default_rng([self.seed, task])
-        n, (obs, act) = self.horizon * self.episodes, self.sizes
+        n, (obs, act) = self.horizon * self.episode_count, self.sizes
         values = {
             "observations": draw.normal(size=(n, obs)),
             "actions": draw.uniform(-1, 1, (n, act)),
@@ -39,7 +39,7 @@ class SyntheticDataset(Dataset):
             "next_observations": draw.normal(size=(n, obs)),
             "terminals": np.zeros(n),
             "timeouts": np.arange(1, n + 1) % self.horizon == 0,
-            "episode": np.repeat(np.arange(self.episodes), self.horizon),
+            "episode": np.repeat(np.arange(self.episode_count), self.horizon),
             "checkpoint": np.zeros(n),
         }
         columns = {name: value.astype(COLUMNS[name]) for name, value in values.items()}
@@ -55,8 +55,8 @@ def synthetic_dataset(env: str, episodes: int, seed: int = 0) -> SyntheticDatase
         seed: of all numbers.
     """
     one = MetaVectorEnv(env, tasks=[0])
-    shapes = (one.single_observation_space.shape, one.single_action_space.shape)
-    obs, act = (int(np.prod(shape)) for shape in shapes)
+    spaces = (one.single_observation_space, one.single_action_space)
+    obs, act = (len(space.sample()) for space in spaces)
     one.close()
     tasks = task_set(env)
     return SyntheticDataset(
@@ -69,6 +69,6 @@ def synthetic_dataset(env: str, episodes: int, seed: int = 0) -> SyntheticDatase
         tasks.params,
         sizes=(obs, act),
         horizon=resolve(env).horizon,
-        episodes=episodes,
+        episode_count=episodes,
         seed=seed,
     )

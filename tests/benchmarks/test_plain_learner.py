@@ -83,5 +83,7 @@ def test_its_losses_stay_equal_to_ours(codebook: bool, monkeypatch: pytest.Monke
         wanted, found = ours.update(), plain.step(contexts, batch)
         for name, value in found.items():
             prefix = "loss/" if f"loss/{name}" in wanted else "loss/encoder/"
-            torch.testing.assert_close(value.detach(), wanted[prefix + name], rtol=1e-4, atol=1e-5, msg=name)
+            torch.testing.assert_close(
+                value.detach(), wanted[prefix + name], rtol=1e-4, atol=1e-5, msg=name
+            )
         assert (found["contrast"] > 0) == codebook
