@@ -128,7 +128,10 @@ def build(engine: Engine, case: str, codebook: bool, seed: int) -> Callable[[], 
 
 def serve(pipe: Connection, engine: Engine, case: str, codebook: bool, seed: int) -> None:
     """One process: answers (threads, seconds) with steps a second of that time."""
-    settle_threads(1)
+    if engine == "ours":
+        settle_threads(1)
+    else:
+        torch.set_num_threads(1)
     step = build(engine, case, codebook, seed)
     step()
     pipe.send(0.0)
