@@ -12,6 +12,7 @@ from torch.distributions import Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 from torch.nn import functional
 
+from ctmrl import networks
 from ctmrl.networks import Actor, BlindEncoder, ContextEncoder, Critic, Predictors, Standardize, mlp
 from tests.ctmrl.examples import ACT, BATCH, LENGTH, OBS, Z, contexts, generator, normal, statistics
 
@@ -169,6 +170,26 @@ def test_the_heads_of_a_critic_are_separate_networks(heads: int) -> None:
             x = functional.relu(x) if layer < 2 else x
         torch.testing.assert_close(found[head], x[:, 0], rtol=1e-4, atol=1e-5)
     assert len(found[:, 0].unique()) == heads
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_critic_gives_the_same_in_blocks_of_rows(
+    frozen: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    critic = Critic(statistics().obs, ACT, (8, 7), heads=2)
+    obs, action = torch.randn(11, OBS), torch.randn(11, ACT)
+    found = []
+    for block in (11, 4):
+        monkeypatch.setattr(networks, "BLOCK", block)
+        given = action.clone().requires_grad_()
+        values = critic(obs, given, frozen=frozen)
+        values.square().sum().backward()
+        gradients = [parameter.grad for parameter in critic.parameters()]
+        assert all((gradient is None) is frozen for gradient in gradients)
+        found.append([values, given.grad, *(() if frozen else gradients)])
+        critic.zero_grad()
+    assert found[0][0].shape == (2, 11)
+    torch.testing.assert_close(found[0], found[1])
 
 
 def test_a_critic_starts_like_torchs_layers() -> None:

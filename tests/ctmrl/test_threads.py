@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from ctmrl.threads import settle_threads
@@ -8,6 +10,8 @@ from ctmrl.threads import settle_threads
 def test_the_settings_are_made() -> None:
     torch.set_flush_denormal(False)
     torch.use_deterministic_algorithms(False)
+    deterministic: Any = torch.utils.deterministic
+    deterministic.fill_uninitialized_memory = True
     tiny = torch.tensor(1e-38)
     assert tiny / 100 > 0
     try:
@@ -15,6 +19,7 @@ def test_the_settings_are_made() -> None:
         assert torch.get_num_threads() == 2
         assert torch.are_deterministic_algorithms_enabled()
         assert tiny / 100 == 0
+        assert not deterministic.fill_uninitialized_memory
     finally:
         settle_threads(1)
     assert torch.get_num_threads() == 1

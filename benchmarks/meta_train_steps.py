@@ -1,0 +1,228 @@
+r"""Gradient steps of CTMRL's meta-training a second: ours beside `plain_learner.py`.
+
+    python benchmarks/meta_train_steps.py --out benchmarks/results/meta_train_steps.csv
+
+Whole steps with sampling and optimisers, on random numbers in the shape of the dataset: the
+field's settings on HalfCheetahVel, and those of `python -m ctmrl.train` without an argument; before
+the codebook is placed and with it. One run of one or two threads, and two seeds side by side, one
+thread each, whose rates add up. Sides take turns; a ratio is taken within one turn, so that a busy
+machine slows both sides of it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from env_steps import write_results
+from plain_learner import PlainLearner
+from rich.console import Console
+from rich.table import Table
+
+from ctmrl.actor_critic import ActorCriticConfig
+from ctmrl.config import MetaTrainConfig, RunConfig
+from ctmrl.data import OfflineData
+from ctmrl.meta_test import MetaTestConfig
+from ctmrl.meta_train import Learner
+from ctmrl.methods.ctmrl import CTMRL, CTMRLConfig
+from ctmrl.presets import preset
+from ctmrl.synthetic import synthetic_dataset
+from ctmrl.threads import settle_threads
+
+EPISODES = 20
+"""Of each task's random numbers."""
+ARRANGEMENTS = {
+    "one run, one thread": (1, 1),
+    "one run, two threads": (1, 2),
+    "two seeds side by side": (2, 1),
+}
+"""Processes and threads of each."""
+Engine = Literal["ours", "plain"]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Measure gradient steps a second, ours against a plain implementation."""
+
+    cases: tuple[str, ...] = ("half_cheetah_vel paper", "point_robot_wind standard")
+    """Environment and settings."""
+    repetitions: int = 7
+    """Turns; the table has their medians."""
+    seconds: float = 3.0
+    """Least time a side is measured in a turn."""
+    out: Path | None = None
+    """CSV file to write; without it nothing is written."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A row of the table and of the CSV file; medians of the turns."""
+
+    case: str
+    codebook: bool
+    arrangement: str
+    repetitions: int
+    ours: float
+    """Steps a second, all processes together."""
+    plain: float
+    ratio: float
+    """Median over the turns of ours / plain."""
+
+
+def settings(case: str, seed: int) -> RunConfig:
+    """The settings of a case; on HalfCheetahVel those of the field."""
+    if case == "point_robot_wind standard":
+        return preset("point_robot_wind", "ctmrl", "standard", seed=seed)
+    if case != "half_cheetah_vel paper":
+        raise SystemExit(f"no case '{case}'")
+    training = MetaTrainConfig(
+        steps=105_000, batch_size=256, context_episodes=5, context_size=100, decay=False
+    )
+    actor_critic = ActorCriticConfig(
+        hidden=(256, 256, 256),
+        gamma=0.99,
+        reward_scale=5.0,
+        learning_rate=3e-4,
+        target_rate=0.005,
+        behavior_regularization=True,
+    )
+    context = CTMRLConfig(
+        encoder_hidden=(200, 200, 200),
+        encoder_lr=3e-4,
+        next_obs_in_context=False,
+        codes=16,
+        predictor_hidden=(256, 256, 256),
+    )
+    return RunConfig(
+        training, actor_critic, context, MetaTestConfig(), env="half_cheetah_vel", seed=seed
+    )
+
+
+def build(engine: Engine, case: str, codebook: bool, seed: int) -> Callable[[], object]:
+    """A learner's gradient step."""
+    config = settings(case, seed)
+    dataset = synthetic_dataset(config.env, EPISODES)
+    data = OfflineData(dataset, dataset.train_tasks)
+    if engine == "ours":
+        ours = Learner(config, data)
+        assert isinstance(ours.method, CTMRL)
+        # Few steps are taken, so the schedule does not get to place it.
+        ours.method.codebook.placed.fill_(codebook)
+        return ours.update
+    torch.manual_seed(seed)
+    statistics = data.statistics(config.context.next_obs_in_context)
+    plain = PlainLearner(config, [dataset.read(int(t)) for t in dataset.train_tasks], statistics)
+    plain.with_codebook = codebook
+    return plain.update
+
+
+def serve(pipe: Connection, engine: Engine, case: str, codebook: bool, seed: int) -> None:
+    """One process: answers (threads, seconds) with steps a second of that time."""
+    if engine == "ours":
+        settle_threads(1)
+    else:
+        torch.set_num_threads(1)
+    step = build(engine, case, codebook, seed)
+    step()
+    pipe.send(0.0)
+    while True:
+        threads, seconds = pipe.recv()
+        torch.set_num_threads(threads)
+        done, start = 0, time.perf_counter()
+        while (elapsed := time.perf_counter() - start) < seconds:
+            step()
+            done += 1
+        pipe.send(done / elapsed)
+
+
+class Side:
+    """Two processes of an engine."""
+
+    def __init__(self, engine: Engine, case: str, codebook: bool) -> None:
+        """Start them and wait until both have taken a step."""
+        context = multiprocessing.get_context("spawn")
+        self._members = []
+        for seed in (0, 1):
+            pipe, end = context.Pipe()
+            arguments = (end, engine, case, codebook, seed)
+            process = context.Process(target=serve, args=arguments, daemon=True)
+            process.start()
+            end.close()
+            self._members.append((process, pipe))
+        for _, pipe in self._members:
+            pipe.recv()
+
+    def rate(self, processes: int, threads: int, seconds: float) -> float:
+        """Steps a second of so many processes together."""
+        asked = [pipe for _, pipe in self._members[:processes]]
+        for pipe in asked:
+            pipe.send((threads, seconds))
+        return sum(float(pipe.recv()) for pipe in asked)
+
+    def close(self) -> None:
+        """End them."""
+        for process, _ in self._members:
+            process.kill()
+            process.join()
+
+
+def measure(case: str, codebook: bool, options: Benchmark) -> list[Result]:
+    """All arrangements of a case."""
+    with ExitStack() as stack:
+        ours, plain = Side("ours", case, codebook), Side("plain", case, codebook)
+        stack.callback(ours.close)
+        stack.callback(plain.close)
+        results = []
+        for name, (processes, threads) in ARRANGEMENTS.items():
+            turns = np.array(
+                [
+                    [side.rate(processes, threads, options.seconds) for side in (ours, plain)]
+                    for _ in range(options.repetitions)
+                ]
+            )
+            ours_rate, plain_rate = np.median(turns, axis=0).round(2).tolist()
+            ratio = float(np.median(turns[:, 0] / turns[:, 1]))
+            results.append(
+                Result(
+                    case,
+                    codebook,
+                    name,
+                    options.repetitions,
+                    ours_rate,
+                    plain_rate,
+                    round(ratio, 2),
+                )
+            )
+        return results
+
+
+def main() -> int:
+    """Run the benchmark."""
+    options, console = tyro.cli(Benchmark), Console()
+    table = Table("settings", "codebook", "arrangement", "ours", "plain", "ratio")
+    results = []
+    for case in options.cases:
+        for codebook in (False, True):
+            for one in measure(case, codebook, options):
+                results.append(one)
+                words = (one.case, "yes" if codebook else "no", one.arrangement)
+                table.add_row(*words, *map(str, (one.ours, one.plain, one.ratio)))
+    console.print(table)
+    if options.out is not None:
+        write_results(options.out, results, {"torch": torch.__version__})
+        console.print(f"Wrote {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
