@@ -25,7 +25,6 @@ from scipy import stats
 
 from datagen.budgets import BUDGETS, Budget, FleetSettings, budget
 from datagen.collect import CollectionError, InterruptedCollectionError, collect
-from datagen.fleet.networks import best_precision
 from datagen.plan import Plan
 from meta_envs import resolve, task_set
 
@@ -69,8 +68,7 @@ def engines(options: Curves) -> Iterator[tuple[str, Budget]]:
     yield "sb3", row
     size = -(-options.tasks // options.workers)
     yield "fleet-float32", replace(row, fleet=FleetSettings(size, "float32"))
-    if best_precision() == "bfloat16":
-        yield "fleet-bfloat16", replace(row, fleet=FleetSettings(size, "bfloat16"))
+    yield "fleet-bfloat16", replace(row, fleet=FleetSettings(size, "bfloat16"))
 
 
 def interval(values: NDArray[np.float64]) -> tuple[float, float]:

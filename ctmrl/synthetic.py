@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from datagen.dataset import COLUMNS, Dataset, TaskData
+from datagen.dataset import COLUMNS, Dataset, Episodes, TaskData
 from meta_envs import MetaVectorEnv, resolve, task_set
 
 
@@ -44,6 +45,15 @@ class SyntheticDataset(Dataset):
         }
         columns = {name: value.astype(COLUMNS[name]) for name, value in values.items()}
         return TaskData(task, columns, {})
+
+    def episodes(self, task: int) -> Episodes:
+        """The task's episodes, all of one length."""
+        count = self.episode_count
+        return Episodes(np.full(count, self.horizon), np.zeros(count, dtype=np.int32))
+
+    def blocks(self, task: int, rows: int = 0) -> Iterator[TaskData]:
+        """The task's data, which are in memory anyway, as one block whatever the rows."""
+        yield self.read(task)
 
 
 def synthetic_dataset(env: str, episodes: int, seed: int = 0) -> SyntheticDataset:
