@@ -1,18 +1,21 @@
-r"""How many steps a behaviour policy needs: learning curves at four times the standard budget.
+r"""How many steps a behaviour policy needs: learning curves far beyond the standard budget.
 
-    python benchmarks/budget_curves.py --env half_cheetah_vel --work ~/budget_curves
+    python benchmarks/budget_curves.py --env ant_goal --work ~/budget_curves
 
 Collects train tasks of an environment with the standard budget's fleet, but for four times its
-steps (killed and run again, it goes on). A policy's worth after a number of steps is the best mean
-return of any checkpoint so far, above the random policy's; the table has its mean over tasks, and
-its share of what four times these steps reach. Writes benchmarks/results/budget_curves_ENV.csv,
-and docs/results/budget_curves.png with all environments that have such a file.
+steps (killed and run again, it goes on). A policy's worth after a number of steps is the mean
+return of its last three checkpoints above the random policy's; the table has its mean over tasks,
+and its share of what four times these steps reach. Writes
+benchmarks/results/budget_curves_ENV.csv, and docs/results/budget_curves.png with all environments
+that have such a file.
 """
 
 from __future__ import annotations
 
 import csv
+import os
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,8 +34,10 @@ from meta_envs import resolve, task_set
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks/results"
-TIMES, PARTS = 4, 10
-"""So many times the standard budget's steps, and so many checkpoints in each of those times."""
+TIMES, CHECKPOINTS = 4, 40
+"""So many times the steps a budget is compared with, and so many checkpoints up to there."""
+LAST = 3
+"""So many checkpoints are averaged: a policy's return goes up and down between two of them."""
 ENOUGH = 0.9
 """Share of what four times the steps reach that a budget must reach."""
 FIRST = ("task", "random")
@@ -41,18 +46,18 @@ FIRST = ("task", "random")
 
 @dataclass(frozen=True)
 class BudgetCurves:
-    """Learning curves of behaviour policies at four times the standard budget's steps."""
+    """Learning curves of behaviour policies, by default up to four times the standard budget."""
 
     env: str
     """Environment."""
     work: Path
     """Folder for the datasets, outside the repository."""
+    steps: int | None = None
+    """Last step, a multiple of 1,600; four times the standard budget's by default."""
     tasks: int = 8
     """Number of train tasks, spread over them."""
-    fleet_size: int = 4
-    """Tasks of a group; a process trains a group."""
-    workers: int = 2
-    """Processes, one thread each."""
+    fleet_size: int = 8
+    """Tasks of a group; a process of one thread trains a group."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +78,10 @@ class Curves:
 
     @property
     def worth(self) -> NDArray[np.float64]:
-        """Best mean return so far above the random policy's, mean over tasks, [C]."""
-        best = np.maximum.accumulate(self.returns, axis=1) - self.random[:, None]
-        worth: NDArray[np.float64] = best.mean(axis=0)
-        return worth
+        """Mean return of the last checkpoints above the random policy's, over tasks, [C]."""
+        means = self.returns.mean(axis=0) - self.random.mean()
+        parts = [means[max(0, end - LAST) : end].mean() for end in range(1, len(means) + 1)]
+        return np.array(parts)
 
     @property
     def shares(self) -> dict[int, float]:
@@ -89,12 +94,19 @@ class Curves:
         }
 
 
-def long_budget(env: str) -> Budget:
-    """The standard budget for four times its steps."""
+def long_budget(env: str, steps: int | None) -> Budget:
+    """The standard budget for other steps.
+
+    Raises:
+        ValueError: steps that are no multiple of the checkpoints' and the updates' distances.
+    """
     row = budget(env, "standard")
-    every = row.steps // PARTS
-    marks = tuple(range(every, TIMES * row.steps + 1, every))
-    return replace(row, name="curves", steps=marks[-1], checkpoints=marks)
+    steps = TIMES * row.steps if steps is None else steps
+    unit = 2 * CHECKPOINTS * row.sac.update_every
+    if steps < unit or steps % unit:
+        raise ValueError(f"--steps must be a multiple of {unit}, got {steps}")
+    marks = tuple(steps * part // CHECKPOINTS for part in range(1, CHECKPOINTS + 1))
+    return replace(row, name="curves", steps=steps, random_steps=marks[0] // 2, checkpoints=marks)
 
 
 def measure(options: BudgetCurves, console: Console) -> Curves:
@@ -106,13 +118,14 @@ def measure(options: BudgetCurves, console: Console) -> Curves:
         InterruptedCollectionError: Ctrl-C.
     """
     name = resolve(options.env).name
-    row = long_budget(name)
+    row = long_budget(name, options.steps)
     # A dataset's card looks its budget up.
     BUDGETS[name] = {**BUDGETS[name], row.name: row}
     row = engine_of(row, CollectConfig(name, fleet_size=options.fleet_size))
     train = task_set(name).train_tasks
     tasks = train[np.linspace(0, len(train) - 1, options.tasks).round().astype(int)]
-    plan = Plan(name, tuple(tasks.tolist()), row, 0, options.work / name, options.workers)
+    groups, folder = row.groups(tasks.tolist()), options.work / name
+    plan = Plan(name, groups, row, 0, folder, os.cpu_count() or 1)
     records = collect(plan, console)["tasks"]
     return Curves(
         tasks,
@@ -156,8 +169,8 @@ def draw(path: Path) -> None:
         curves = read(file)
         steps = curves.marks / 1000
         axes.plot(steps, curves.returns.T, color="#3b6ea5", alpha=0.25, linewidth=0.8)
-        best = curves.worth + curves.random.mean()
-        axes.plot(steps, best, color="#c1666b", label="best so far, mean")
+        mean = curves.returns.mean(axis=0)
+        axes.plot(steps, mean, color="#c1666b", label="mean over tasks")
         axes.axhline(curves.random.mean(), color="0.6", linestyle=":", label="random")
         name = file.stem.removeprefix("budget_curves_")
         axes.axvline(budget(name, "standard").steps / 1000, color="0.3", linestyle="--")
@@ -168,23 +181,31 @@ def draw(path: Path) -> None:
     figure.savefig(path, dpi=120, metadata={"Software": None})
 
 
+def enough_steps(shares: Mapping[int, float]) -> int | None:
+    """The fewest steps from which on all shares are enough, or None."""
+    found = None
+    for mark in sorted(shares, reverse=True):
+        if shares[mark] < ENOUGH:
+            break
+        found = mark
+    return found
+
+
 def report(curves: Curves, title: str, console: Console) -> None:
     """The table, and the fewest steps that are enough."""
-    table = Table("steps", "return", "best so far", "share of 4 x the steps", title=title)
+    table = Table("steps", "return", f"share of {TIMES} x", "share of the last", title=title)
     for place, mark in enumerate(curves.marks.tolist()):
-        best = curves.worth[place] + curves.random.mean()
         share = curves.shares.get(mark)
         table.add_row(
             f"{mark:,}",
             f"{curves.returns[:, place].mean():.1f}",
-            f"{best:.1f}",
             "" if share is None else f"{share:.2f}",
+            f"{curves.worth[place] / curves.worth[-1]:.2f}",
         )
     console.print(table)
-    enough = [mark for mark, share in curves.shares.items() if share >= ENOUGH]
     console.print(
-        f"fewest steps with {ENOUGH:.0%} of what {TIMES} times the steps reach: "
-        f"{min(enough, default='none of these')}"
+        f"fewest steps from which on {ENOUGH:.0%} of what {TIMES} times the steps reach: "
+        f"{enough_steps(curves.shares) or 'none of these'}"
     )
 
 

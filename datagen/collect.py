@@ -40,6 +40,10 @@ MOST_WORKERS = 8
 """Default number of workers on a machine with more cores than that; each needs 0.4 GB."""
 
 
+LONG = 400_000
+"""Updates of all missing tasks from which on a collection first measures how long it will take."""
+
+
 @dataclass(frozen=True)
 class CollectConfig:
     """Collect an offline dataset: train a behaviour policy on every task and roll it out.
@@ -211,6 +215,8 @@ def _collect(plan: Plan, console: Console) -> dict[str, Any]:
     finished = len(plan.tasks) - len(missing)
     if finished:
         console.print(f"{finished} of {len(plan.tasks)} tasks are already finished.")
+    if plan.ray is None and len(missing) * plan.budget.updates >= LONG:
+        _say(console, _estimate(plan, missing))
     jobs = [
         Job(plan.env, task, plan.budget, plan.seed, plan.folder, group, plan.policies)
         for group in plan.groups
@@ -288,8 +294,12 @@ def describe(plan: Plan, console: Console) -> None:
     for name, text in lines.items():
         _say(console, f"{name + ':':13}{text}")
     if missing:
-        time = duration(seconds_of(plan, missing))
-        _say(console, f"{'time:':13}about {time} with {_count(plan.workers, 'worker')}")
+        _say(console, f"{'time:':13}{_estimate(plan, missing)}")
+
+
+def _estimate(plan: Plan, missing: Sequence[int]) -> str:
+    time = duration(seconds_of(plan, missing))
+    return f"about {time} with {_count(plan.workers, 'worker')}"
 
 
 def _groups_text(groups: Sequence[tuple[int, ...]]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from datagen.budgets import BUDGETS, FleetSettings, budget, other_options
@@ -33,6 +34,19 @@ def test_every_environment_has_the_three_budgets(env: str) -> None:
         assert row.checkpoints[0] - row.random_steps >= 2 * row.sac.update_every
         assert row.fleet is not None
         assert row.fleet.precision == "auto"
+
+
+@pytest.mark.parametrize("env", MUJOCO_ROBOTS)
+def test_robots_follow_the_protocol_at_fewer_steps(env: str) -> None:
+    field, found = budget(env, "paper"), budget(env, "standard")
+    assert (field.steps, field.random_steps, field.episodes) == (1_000_000, 50_000, 50)
+    # The same shares of the training: random steps, early checkpoints and late ones.
+    marks, theirs = np.array(found.checkpoints), np.array(field.checkpoints)
+    np.testing.assert_array_equal(marks * field.steps, theirs * found.steps)
+    assert found.random_steps * field.steps == field.random_steps * found.steps
+    shared = ("gamma", "tau", "update_every", "initial_temperature")
+    for name in shared:
+        assert getattr(found.sac, name) == getattr(field.sac, name)
 
 
 def test_config_is_json_and_has_every_number() -> None:

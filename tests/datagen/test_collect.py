@@ -232,6 +232,22 @@ def test_a_dry_run_touches_nothing(
     assert not (folder / "new").exists()
 
 
+def test_a_long_collection_says_first_how_long_it_will_take(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    monkeypatch.setattr(collect, "seconds_of", lambda plan, missing: 60.0 * len(missing))
+    (folder / "task_004.h5").unlink()
+    arguments = [*ARGUMENTS, "--workers", "1", "--out", str(folder)]
+    # One task has this many updates.
+    monkeypatch.setattr(collect, "LONG", SMOKE.updates)
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.splitlines()[1] == "about 60 s with 1 worker"
+    (folder / "task_004.h5").unlink()
+    monkeypatch.setattr(collect, "LONG", SMOKE.updates + 1)
+    assert main(arguments) == 0
+    assert "about" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("module", "heavy"),
     [("collect", {"torch", "stable_baselines3"}), ("inspect", {"torch", "matplotlib"})],
