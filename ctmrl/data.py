@@ -131,8 +131,11 @@ class OfflineData:
         reward, context = self._layout.reward, self._layout.context
         seen = context if next_obs_in_context else reward + 1
         columns = slice(self.obs_dim), slice(seen), slice(reward, context)
-        parts = (*(self.table[:, part] for part in columns), self.params)
-        return Statistics(*((x.mean(dim=0), x.std(dim=0)) for x in parts))
+        parts = (self.table[:, part] for part in columns)
+        obs, context, target = ((x.mean(dim=0), x.std(dim=0)) for x in parts)
+        # A single task has no spread.
+        spread = self.params.std(dim=0, correction=min(1, len(self) - 1))
+        return Statistics(obs, context, target, (self.params.mean(dim=0), spread))
 
     def __len__(self) -> int:
         """Number of tasks T."""

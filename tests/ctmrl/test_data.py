@@ -174,7 +174,7 @@ def test_statistics_are_exactly_those_of_the_whole_columns(wind_data: OfflineDat
     before = wind_data.table[:, :5]
     for next_obs in (True, False):
         seen = torch.cat([before, change], dim=1) if next_obs else before
-        wanted = obs, seen, torch.cat([before[:, -1:], change], dim=1)
+        wanted = obs, seen, torch.cat([before[:, -1:], change], dim=1), wind_data.params
         found = wind_data.statistics(next_obs)
         for (mean, std), values in zip(found, wanted, strict=True):
             assert mean.equal(values.mean(dim=0))

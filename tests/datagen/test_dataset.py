@@ -112,7 +112,7 @@ def test_what_happened_to_a_file_is_said(folder: Path, tmp_path: Path) -> None:
     content = path.read_bytes()
     remedy = (
         "delete it and run `python -m datagen.collect --env point_robot_wind --tasks 3 "
-        f"--budget smoke --seed 0 --out {folder}`, or fetch it again"
+        f"--budget smoke --seed 0 --engine sb3 --out {folder}`, or fetch it again"
     )
     other_env = write_dataset(tmp_path / "sparse_point_robot", (3,), "sparse_point_robot")
     other_seed = write_dataset(tmp_path / "other", (3,), seed=1)
@@ -207,7 +207,8 @@ def test_an_index_of_other_times_is_told_from_damage(folder: Path) -> None:
         (folder / "dataset.json").write_text(json.dumps(edited, sort_keys=True, indent=1) + "\n")
         command = (
             "run `python -m datagen.collect --env point_robot_wind --budget smoke --seed 0 "
-            f"--out {folder}`, which keeps intact task files, or fetch the dataset again"
+            f"--engine sb3 --out {folder}`, which keeps intact task files, or fetch the dataset "
+            "again"
         )
         refuse(folder, f"dataset.json: {fault}.*; {re.escape(command)}")
     edited = {**index, "seed": 1, "sha256": digest("something else")}
