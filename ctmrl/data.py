@@ -130,12 +130,14 @@ class OfflineData:
         """The statistics, while the table has changes in place of next observations."""
         reward, context = self._layout.reward, self._layout.context
         seen = context if next_obs_in_context else reward + 1
-        columns = slice(self.obs_dim), slice(seen), slice(reward, context)
-        parts = (self.table[:, part] for part in columns)
-        obs, context, target = ((x.mean(dim=0), x.std(dim=0)) for x in parts)
         # A single task has no spread.
         spread = self.params.std(dim=0, correction=min(1, len(self) - 1))
-        return Statistics(obs, context, target, (self.params.mean(dim=0), spread))
+        return Statistics(
+            obs=_moments(self.table[:, : self.obs_dim]),
+            context=_moments(self.table[:, :seen]),
+            target=_moments(self.table[:, reward:context]),
+            params=(self.params.mean(dim=0), spread),
+        )
 
     def __len__(self) -> int:
         """Number of tasks T."""
@@ -230,6 +232,11 @@ class OfflineData:
         start = self._episode_start[chosen].view(len(tasks), sets, episodes)
         within = offset - (ends - lengths).gather(2, which)
         return (start.gather(2, which) + within).transpose(0, 1).flatten()
+
+
+def _moments(columns: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of each column, [n, D] -> two of [D]."""
+    return columns.mean(dim=0), columns.std(dim=0)
 
 
 def _rows(data: TaskData, timeouts_as_terminals: bool, dense_context: bool) -> NDArray[np.float32]:
