@@ -70,6 +70,7 @@ class OfflineData:
         act_dim: A.
         params: float32 [T, P], the tasks' true parameters, which no method but a reference sees.
         table: [N, 2 O + A + 3].
+        largest_reward: largest absolute reward the actor-critic learns from.
     """
 
     def __init__(
@@ -116,6 +117,8 @@ class OfflineData:
         self._fill(dataset, lambda data: _with_changes(rows_of(data), self._layout))
         self._statistics = {seen: self._measure(seen) for seen in (False, True)}
         self._fill(dataset, rows_of)
+        # Now, because after this to read all rows in their order is slow.
+        self.largest_reward = float(self.unpack(self.table).reward.abs().max())
         self._table.filled()
 
     def _fill(self, dataset: Dataset, rows_of: Callable[[TaskData], NDArray[np.float32]]) -> None:

@@ -68,9 +68,8 @@ class Learner:
             for name, optimizer in self.optimizers.items()
         }
         self._every = torch.arange(len(data))
-        reward = float(torch.linalg.vector_norm(data.unpack(data.table).reward, torch.inf))
         entropy = self.actor_critic.entropy_coef * data.act_dim
-        self._limits = {LARGEST_Q: q_limit(reward, entropy, config.actor_critic.gamma)}
+        self._limits = {LARGEST_Q: q_limit(data.largest_reward, entropy, config.actor_critic.gamma)}
 
     @property
     def agent(self) -> Agent:

@@ -274,10 +274,12 @@ def other_options(env: str, name: str, config: Mapping[str, Any]) -> list[str]:
     words = [] if episodes == own.episodes else ["--episodes", str(episodes)]
     if fleet is None:
         return [*words, "--engine", "sb3"]
-    if own.fleet is None or fleet["size"] != own.fleet.size:
-        words += ["--fleet-size", str(fleet["size"])]
+    size, device = int(fleet["size"]), str(fleet["device"])
+    # On a GPU a command takes all tasks by itself.
+    if own.fleet is None or device != "cpu" or size != own.fleet.size:
+        words += ["--fleet-size", str(size)]
     words += ["--precision", str(fleet["precision"])]
-    return words if fleet["device"] == "cpu" else [*words, "--device", str(fleet["device"])]
+    return words if device == "cpu" else [*words, "--device", device]
 
 
 def budget(env: str, name: str, episodes: int | None = None) -> Budget:

@@ -29,7 +29,7 @@ from datagen.finished import (
     without_versions,
     write_summary,
 )
-from datagen.job import Job, origin
+from datagen.job import Job, group_file, origin
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration
 from datagen.stages import collect_tasks, train_groups
@@ -113,9 +113,7 @@ def plan_of(config: CollectConfig) -> Plan:
         ValueError: an option is wrong; the message says which and how to do better.
     """
     env = resolve(config.env).name
-    wanted = with_engine(budget(env, config.budget, config.episodes), config)
     tasks = parse_tasks(config.tasks, task_set(env))
-    groups = parse_shard(config.shard, wanted.groups(tasks))
     if config.seed < 0:
         raise ValueError(f"--seed must not be negative, got {config.seed}")
     workers = config.workers
@@ -123,6 +121,8 @@ def plan_of(config: CollectConfig) -> Plan:
         workers = len(tasks) if config.ray else min(_cores(), MOST_WORKERS)
     if workers < 1:
         raise ValueError(f"--workers must be at least 1, got {workers}")
+    wanted = with_engine(budget(env, config.budget, config.episodes), config)
+    groups = parse_shard(config.shard, wanted.groups(tasks))
     folder, policies = config.out or Path("datasets") / env, config.policies
     if config.ray:
         # Processes elsewhere have working folders of their own.
@@ -146,6 +146,8 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
         ValueError: an option is wrong, or of the other engine.
     """
     fleet = budget.fleet
+    if config.engine == "fleet" and fleet is None:
+        raise ValueError(f"the budget {budget.name} has no fleet: leave --engine fleet out")
     if config.engine == "sb3" or fleet is None:
         for name, value, default in (
             ("fleet-size", config.fleet_size, None),
@@ -239,12 +241,14 @@ def _collect(plan: Plan, console: Console) -> dict[str, Any]:
             remove_stale(plan.folder)
     try:
         index = write_summary(plan.folder, origin(plan.env, plan.budget, plan.seed))
-        remove_states(plan.folder)
-        return index
     except OSError as error:
         raise CollectionError(
             f"all tasks are done, but not the index ({error}); the same command continues"
         ) from error
+    states = {group_file(plan.folder, group).name for group in plan.groups}
+    remove_stale(plan.folder, states | {task_file(task) for task in plan.tasks})
+    remove_states(plan.folder)
+    return index
 
 
 def _cluster(plan: Plan) -> AbstractContextManager[None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 import shlex
 import stat
 from collections.abc import Mapping
@@ -200,13 +201,23 @@ def unreadable(path: Path, error: OSError) -> DatasetError:
     return DatasetError(path, f"cannot be read ({reason})", "check its permissions and the disk")
 
 
+def machine() -> str:
+    """This machine's name, without dots."""
+    return platform.node().replace(".", "-")
+
+
+def partial_of(path: Path) -> Path:
+    """Where this process writes a file, or a folder, until it is whole."""
+    return path.with_name(f".{path.name}.{machine()}.{os.getpid()}.partial")
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is whole or absent, whatever happens in between.
 
     Raises:
         OSError: the disk is full or the folder is not there; a file that was there stays.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = partial_of(path)
     try:
         with partial.open("wb") as file:
             file.write(content)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from datagen.card import CARD_FILE, card
 from datagen.dataset import DatasetError, task_file, task_of, write_index
-from datagen.files import digest, read_bytes, write_whole
+from datagen.files import digest, machine, read_bytes, write_whole
 from datagen.job import STATE_FILES
 from datagen.task_files import parse_task
 
-_PARTIAL = re.compile(r"\..+\.(\d+)\.partial")
+_PARTIAL = re.compile(r"\.(.+)\.([^.]*)\.(\d+)\.partial")
 
 
 @dataclass(frozen=True)
@@ -115,13 +115,20 @@ def without_versions(origin: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in origin.items() if key != "versions"}
 
 
-def remove_stale(folder: Path) -> None:
-    """Delete what writers that are no more left half written."""
+def remove_stale(folder: Path, over: Collection[str] = ()) -> None:
+    """Delete what writers that are no more left half written.
+
+    Whether a writer on another machine lives cannot be told from here, so what it left stays.
+
+    Args:
+        folder: whose files.
+        over: names of files that nobody writes any more, on whatever machine.
+    """
     if not folder.is_dir():
         return
     for path in folder.iterdir():
         match = _PARTIAL.fullmatch(path.name)
-        if match and not _alive(int(match[1])):
+        if match and (match[1] in over or (match[2] == machine() and not _alive(int(match[3])))):
             path.unlink(missing_ok=True)
 
 

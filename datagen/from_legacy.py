@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from datagen.dataset import COLUMNS, FORMAT_VERSION, DatasetError, TaskData, task_file, write_task
-from datagen.files import IMPORTED, sync_folder
+from datagen.files import IMPORTED, partial_of, sync_folder
 from datagen.finished import write_summary
 from datagen.legacy_episodes import Columns, Source, probe, to_columns
 from datagen.legacy_files import LegacyFile, LegacyTask, list_legacy, read_episode
@@ -107,7 +107,7 @@ def _whole_folder(out: Path) -> Iterator[Path]:
     if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(out, "is there already", "delete it or choose another --out")
     place = Path(os.path.abspath(out))
-    partial = place.with_name(f".{place.name}.{os.getpid()}.partial")
+    partial = partial_of(place)
     partial.mkdir(parents=True)
     try:
         yield partial

@@ -105,8 +105,9 @@ def parse_shard(text: str | None, groups: Sequence[tuple[int, ...]]) -> tuple[tu
     if index >= count:
         raise ValueError(f"--shard takes i/n with i from 0 to n - 1, such as 0/8, got '{text}'")
     if index >= len(groups):
+        there = "is 1 group" if len(groups) == 1 else f"are {len(groups)} groups"
         raise ValueError(
-            f"--shard {text} is empty: there are {len(groups)} groups of tasks, "
-            f"take n <= {len(groups)}"
+            f"--shard {text} is empty: of these tasks there {there}, take n <= {len(groups)} or a "
+            "smaller --fleet-size"
         )
     return tuple(groups[index::count])

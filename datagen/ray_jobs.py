@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib import metadata
 from itertools import islice
 from types import ModuleType
 from typing import Any, TypeVar
@@ -107,7 +108,7 @@ def run_jobs(
     ray = load_ray()
     news = ray.remote(num_cpus=0, max_restarts=-1)(_News).remote()
     task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_serve)
-    here, waiting, started = versions(), iter(enumerate(jobs)), set()
+    here, waiting, started = _software(), iter(enumerate(jobs)), set()
     running: dict[Any, int] = {}
     try:
         while True:
@@ -149,11 +150,16 @@ class _News:
         return items
 
 
+def _software() -> dict[str, str]:
+    """Versions of all that decides the bytes, this package among them."""
+    return {**versions(), "ctmrl": metadata.version("ctmrl")}
+
+
 def _serve(
     work: Work[Any, Any], job: Any, index: int, news: Any, wanted: dict[str, str]
 ) -> tuple[str, Any]:
     """One task, in a process of the cluster."""
-    here = versions()
+    here = _software()
     if here != wanted:
         name = next(name for name in wanted if here.get(name) != wanted[name])
         return "failed", (
@@ -179,11 +185,15 @@ def _result(ray: ModuleType, ref: Any, index: int) -> Any:
     except ray.exceptions.RayTaskError as error:
         raise WorkerError(index, f"Ray cannot run it ({str(error).splitlines()[-1]})") from None
     except ray.exceptions.RayError as error:
-        raise WorkerError(
-            index,
-            f"its worker process died {RETRIES + 1} times ({type(error).__name__}), as happens "
-            "when the memory is full",
-        ) from None
+        name, known = type(error).__name__, ray.exceptions
+        deaths = (known.WorkerCrashedError, known.NodeDiedError, known.OutOfMemoryError)
+        if isinstance(error, deaths):
+            times = f"{RETRIES + 1} times ({name})"
+            fault = f"its worker process died {times}, as happens when the memory is full"
+        else:
+            reason = str(error).strip().partition("\n")[0]
+            fault = f"Ray cannot run it ({name}: {reason})"
+        raise WorkerError(index, fault) from None
     if kind == "failed":
         raise WorkerError(index, value)
     return value

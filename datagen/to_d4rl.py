@@ -19,7 +19,7 @@ import numpy as np
 
 from datagen.columns import COLUMNS, SPARSE_COLUMN
 from datagen.dataset import Dataset, DatasetError
-from datagen.files import canonical_json, sync_folder
+from datagen.files import canonical_json, partial_of, sync_folder
 from meta_envs.registry import definition
 
 _EXTRA = {"task": np.dtype("<i4")}
@@ -53,7 +53,7 @@ def to_d4rl(
         raise DatasetError(path, "is there already", "delete it or choose another --out")
     records = [dataset.entry(task) for task in tasks]
     folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / f".{path.name}.{os.getpid()}.partial"
+    partial = partial_of(path)
     try:
         _reserve(partial, sum(record["bytes"] for record in records) + 2**20)
         offsets = _lay_out(partial, dataset, records)

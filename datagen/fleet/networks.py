@@ -32,7 +32,7 @@ def check_precision(precision: str, device: str) -> Precision:
         ValueError: torch cannot use the device.
     """
     try:
-        if torch.device(device).type not in ("cpu", "cuda"):
+        if device.partition(":")[0] not in ("cpu", "cuda"):
             raise RuntimeError("fleets learn on cpu and cuda")
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:

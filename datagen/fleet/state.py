@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from datagen.files import canonical_json, parse_canonical, sync_folder, unreadable
+from datagen.files import canonical_json, parse_canonical, partial_of, sync_folder, unreadable
 from datagen.fleet.algorithm import FleetSAC
 
 _ABOUT = "fleet"
@@ -28,7 +28,7 @@ def save_state(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, An
     Raises:
         OSError: the disk is full or the folder is not there.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = partial_of(path)
     held = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     try:
         text = canonical_json({**about, _DIGEST: _digest(held, about)})

@@ -33,6 +33,7 @@ from ctmrl.presets import config_from_settings, preset
 from ctmrl.runs import load_checkpoint, read_json
 from ctmrl.train import best_behavior, default_folder, parse, split_tasks, train
 from datagen.dataset import open_dataset, task_file
+from datagen.files import machine
 from meta_envs import task_set
 from tests.ctmrl.commands import FILES, Commands, contents, rows, wait_until
 from tests.ctmrl.conftest import FinishedRun
@@ -160,7 +161,7 @@ def test_an_interrupted_and_twice_killed_run_ends_in_the_same_bytes(
     assert int(load_checkpoint(path / "checkpoint.pt")["step"]) < 40
     # A pipe that nobody reads holds the command up between the first and the second picture.
     commands.start(*words)
-    pipe = path / f".contexts.png.{commands.child}.partial"
+    pipe = path / f".contexts.png.{machine()}.{commands.child}.partial"
     os.mkfifo(pipe)
     wait_until((path / "adaptation.png").exists)
     commands.send(signal.SIGKILL)

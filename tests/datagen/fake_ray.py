@@ -23,6 +23,22 @@ class WorkerCrashedError(RayError):
     pass
 
 
+class NodeDiedError(RayError):
+    pass
+
+
+class OutOfMemoryError(RayError):
+    pass
+
+
+class RuntimeEnvSetupError(RayError):
+    pass
+
+
+class Refusal(BaseException):
+    """Raised by a job that Ray never starts."""
+
+
 class Death(BaseException):
     """Raised by a job whose process dies."""
 
@@ -42,6 +58,8 @@ class Ref:
                 self.value = self.call()
             except Death:
                 continue
+            except Refusal:
+                self.error = RuntimeEnvSetupError("no room\nand a long text")
             except Exception as error:
                 self.error = RayTaskError(f"a long text\n{error!r}")
             return
@@ -120,7 +138,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> FakeRay:
     for name in ("init", "shutdown", "remote", "wait", "get", "cancel", "kill"):
         setattr(module, name, getattr(fake, name))
     errors = ModuleType("ray.exceptions")
-    for error in (RayError, RayTaskError, WorkerCrashedError):
+    for error in (RayError, RayTaskError, WorkerCrashedError, NodeDiedError, OutOfMemoryError):
         setattr(errors, error.__name__, error)
     module.exceptions = errors  # type: ignore[attr-defined]  # it is a module for a test
     monkeypatch.setitem(sys.modules, "ray", module)

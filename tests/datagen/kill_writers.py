@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from datagen.files import write_whole
+from datagen.files import machine, write_whole
 
 SIZE = 3_000_000
 CONTENTS = (b"a" * SIZE, b"b" * SIZE)
@@ -39,7 +39,7 @@ def kill_one(folder: Path, delay: float) -> dict[str, bool]:
         "there": path.exists(),
         "whole": path.exists() and path.read_bytes() in CONTENTS,
         "partial": bool(names - {path.name}),
-        "only_its_own": names <= {path.name, f".{path.name}.{child}.partial"},
+        "only_its_own": names <= {path.name, f".{path.name}.{machine()}.{child}.partial"},
     }
 
 

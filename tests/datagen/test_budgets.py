@@ -90,7 +90,9 @@ def test_options_that_a_budget_alone_does_not_say(
     assert other_options(env, "smoke", config) == [*options, *precision]
     if fleet:
         other = replace(budget(env, "smoke"), fleet=replace(fleet, device="cuda")).config()
-        assert other_options(env, "smoke", other) == [*options, *precision, "--device", "cuda"]
+        # There, a command takes all tasks by itself, so their number is always said.
+        size = ["--fleet-size", str(fleet.size)]
+        assert other_options(env, "smoke", other) == [*size, *precision, "--device", "cuda"]
     config["episodes"] = 13
     assert other_options(env, "smoke", config) == ["--episodes", "13", *options, *precision]
 

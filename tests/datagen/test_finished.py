@@ -14,6 +14,7 @@ import pytest
 from datagen import finished
 from datagen.budgets import budget
 from datagen.dataset import DatasetError, TaskData, open_dataset, task_file, write_index, write_task
+from datagen.files import machine
 from datagen.finished import remove_stale, remove_states, scan, without_versions, write_summary
 from datagen.fleet.state import save_state
 from datagen.job import group_file, origin
@@ -100,13 +101,21 @@ def test_a_damaged_file_is_an_error(tmp_path: Path) -> None:
 def test_what_dead_writers_left_is_removed(tmp_path: Path) -> None:
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    stale = tmp_path / f".task_003.h5.{ended.pid}.partial"
-    living = tmp_path / f".task_004.h5.{os.getppid()}.partial"
+    stale = tmp_path / f".task_003.h5.{machine()}.{ended.pid}.partial"
+    living = tmp_path / f".task_004.h5.{machine()}.{os.getppid()}.partial"
+    # A dead process here may be a living one there, and the other way round.
+    elsewhere = [
+        tmp_path / f".task_{task:03d}.h5.elsewhere.{pid}.partial"
+        for task, pid in ((5, ended.pid), (6, os.getpid()))
+    ]
     other = tmp_path / ".hidden.partial"
-    for path in (stale, living, other):
+    paths = (stale, living, *elsewhere, other)
+    for path in paths:
         path.write_text("half")
     remove_stale(tmp_path)
-    assert [path.exists() for path in (stale, living, other)] == [False, True, True]
+    assert [path.exists() for path in paths] == [False, True, True, True, True]
+    remove_stale(tmp_path, {"task_006.h5"})
+    assert [path.exists() for path in paths] == [False, True, True, False, True]
 
 
 def test_trainings_of_finished_tasks_are_removed(tmp_path: Path) -> None:

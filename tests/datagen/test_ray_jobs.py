@@ -20,7 +20,7 @@ from datagen.collect import main
 from datagen.ray_jobs import QUIET, RETRIES, connected, run_jobs
 from datagen.workers import THREAD_VARIABLES, Event, Report, WorkerError
 from tests.datagen.environments import other_environment
-from tests.datagen.fake_ray import Death, FakeRay, install
+from tests.datagen.fake_ray import Death, FakeRay, Refusal, install
 
 Capture = pytest.CaptureFixture[str]
 SMOKE = ("--env", "point_robot_wind", "--budget", "smoke", "--tasks", "0-1")
@@ -92,6 +92,7 @@ def raises(error: BaseException) -> Callable[[int, Report], int]:
         (ValueError("one sentence"), "^one sentence$"),
         (KeyError("x"), "(?s)^an error in the program.*Traceback.*KeyError"),
         (BrokenPipeError("it"), r"^Ray cannot run it \(BrokenPipeError\('it'\)\)$"),
+        (Refusal(), r"^Ray cannot run it \(RuntimeEnvSetupError: no room\)$"),
         (Death(), rf"^its worker process died {RETRIES + 1} times \(WorkerCrashedError\), as happ"),
     ],
 )
