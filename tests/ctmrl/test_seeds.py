@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import re
 import signal
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -16,11 +17,12 @@ import pytest
 from rich.console import Console
 
 from ctmrl import seeds
+from ctmrl.config import RunConfig
 from ctmrl.errors import UsageError
 from ctmrl.report import print_report
-from ctmrl.seeds import News, SeedsDisplay, each_in_a_process, plan, train_seeds
+from ctmrl.seeds import News, SeedsDisplay, Train, each_in_a_process, plan, train_seeds
 from ctmrl.summary import find_records
-from ctmrl.train import parse
+from ctmrl.train import main, parse
 from tests.ctmrl.commands import Commands, contents, rows, wait_until
 from tests.ctmrl.conftest import FinishedRun
 from tests.ctmrl.examples import record, smoke
@@ -158,6 +160,27 @@ def test_options_that_do_not_tell_the_seeds_are_one_sentence(words: str, said: s
     with pytest.raises(UsageError) as caught:
         parse(words.split())
     assert str(caught.value) == said
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_where_seeds_go_and_how_the_command_exits(
+    code: int, wind_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = []
+
+    def note(train: Train, config: RunConfig, folder: Path, console: Console) -> int:
+        folders.append((folder, config.seeds))
+        return code
+
+    monkeypatch.setattr(seeds, "train_seeds", note)
+    words = ["train", "--method", "focal", "--data", str(wind_path), "--seeds", "4", "2"]
+    for more in (["--validate"], ["--out", "here"]):
+        monkeypatch.setattr(sys, "argv", [*words, *more])
+        with pytest.raises(SystemExit) as caught:
+            main()
+        assert caught.value.code == code
+    default = Path("runs/point_robot_wind/focal-validation")
+    assert folders == [(default, (4, 2)), (Path("here"), (4, 2))]
 
 
 def test_the_options_are_explained(capsys: pytest.CaptureFixture[str]) -> None:
