@@ -58,6 +58,11 @@ class RunConfig:
     on a small machine) or smoke (seconds, learns little)."""
     seed: int = 0
     """Of everything random in the run."""
+    seeds: tuple[int, ...] = ()
+    """In place of --seed: train all of these side by side, each in a process of its own and to what
+    it makes alone, into seed-<n> of --out or of runs/<environment>/<method>."""
+    workers: int | None = None
+    """Most of --seeds to train at a time; default one for each core, or each --threads cores."""
     data: Path | None = None
     """Dataset folder; default datasets/<environment>."""
     quality: Quality = "mixed"
@@ -106,7 +111,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "data_episodes": (1, math.inf),
     "meta_batch": (2, math.inf),
     "memory": (0, math.inf),
-    "seed": (0, 2**63 - 1),
+    **dict.fromkeys(("seed", "seeds"), (0, 2**63 - 1)),
+    "workers": (1, math.inf),
 }
 """Least and largest value of the options that have them."""
 

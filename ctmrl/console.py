@@ -16,6 +16,9 @@ from rich.table import Table
 from ctmrl.errors import Diverged, UsageError
 from datagen.dataset import DatasetError
 
+MISTAKES = (UsageError, DatasetError, OSError)
+"""Errors whose message is the sentence a user needs: their own mistake, or a disk's refusal."""
+
 KINDS = {
     "return": "return",
     "loss/encoder": "encoder losses",
@@ -39,7 +42,7 @@ def run_command(command: Callable[[], None]) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("Stopped. The same command goes on from the last checkpoint.\n")
         return 130
-    except (UsageError, DatasetError, OSError) as error:
+    except MISTAKES as error:
         sys.stderr.write(f"error: {error}\n")
         return 1 if isinstance(error, Diverged) else 2
     return 0

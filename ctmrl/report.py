@@ -30,6 +30,7 @@ from ctmrl.summary import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from rich.console import Console
 
 LABELS = {
     "oracle": "oracle (exact optimum)",
@@ -238,19 +239,23 @@ def summary_table(env: str, group: str, results: list[Result]) -> Table:
     return table
 
 
-def main(config: ReportConfig) -> None:
-    """Read the runs and print."""
-    from rich.console import Console
-
-    records = find_records(config.runs)
+def print_report(records: list[dict[str, Any]], console: Console) -> list[Result]:
+    """Print runs' records as tables over their seeds, and give what the tables are made of."""
     results = collate(records)
-    console = Console()
     for env, group in dict.fromkeys((result.env, result.group) for result in results):
         rows = [result for result in results if (result.env, result.group) == (env, group)]
         console.print(summary_table(env, group, rows))
         for result in rows:
             values = ", ".join(f"{value:.3f}" for value in result.returns)
             console.print(f"{result.method}, seed by seed: {values}", soft_wrap=True)
+    return results
+
+
+def main(config: ReportConfig) -> None:
+    """Read the runs and print."""
+    from rich.console import Console
+
+    results = print_report(find_records(config.runs), Console())
     if config.csv is not None:
         config.csv.parent.mkdir(parents=True, exist_ok=True)
         from datagen.dataset import write_whole

@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from ctmrl.config import RunConfig
     from ctmrl.meta_train import Learner
     from ctmrl.runs import RunFolder
+    from ctmrl.seeds import Watch
     from datagen.dataset import Dataset
 
 LOGS, CHECKPOINTS, RETURNS = 100, 50, 10
 """Rows of metrics, checkpoints, and measured returns on training tasks in a run."""
-NOT_SETTINGS = {"data", "out", "restart", "loggers", "memory"}
+NOT_SETTINGS = {"data", "out", "restart", "loggers", "memory", "seeds", "workers"}
 """Fields of RunConfig that do not change a run's results."""
 PACKAGES = ("ctmrl", "numpy", "torch", "gymnasium", "scikit-learn")
 
@@ -87,6 +88,20 @@ def settings_of(
     }
 
 
+def check(config: RunConfig) -> Dataset:
+    """Check all that can be told before the data are read, and open them.
+
+    Raises:
+        UsageError: settings or a dataset that cannot be used.
+    """
+    from ctmrl.config import check_settings
+    from ctmrl.loggers import check_loggers
+
+    check_settings(config)
+    check_loggers(config.loggers)
+    return open_data(config)
+
+
 def open_data(config: RunConfig) -> Dataset:
     """Open the run's slice of its dataset.
 
@@ -112,8 +127,13 @@ def open_data(config: RunConfig) -> Dataset:
     return dataset.select(config.quality, config.data_episodes)
 
 
-def train(config: RunConfig, console: Console) -> dict[str, Any]:
+def train(config: RunConfig, console: Console, watch: Watch | None = None) -> dict[str, Any]:
     """Train, or go on training, then evaluate; everything goes into the run folder.
+
+    Args:
+        config: the run.
+        console: where to show it.
+        watch: also shown how it goes on.
 
     Returns:
         The evaluation's record.
@@ -123,18 +143,14 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
         Diverged: a quantity that is not finite, or a Q beyond what rewards explain.
     """
     from ctmrl import runs
-    from ctmrl.config import check_settings
     from ctmrl.data import OfflineData
     from ctmrl.errors import Diverged
-    from ctmrl.loggers import check_loggers
     from ctmrl.meta_train import Learner
     from ctmrl.table import Room
     from ctmrl.threads import settle_threads
 
-    check_settings(config)
-    check_loggers(config.loggers)
+    dataset = check(config)
     settle_threads(config.threads)
-    dataset = open_data(config)
     split = split_tasks(dataset, config.validate)
     path = config.out or default_folder(config)
     data = OfflineData(
@@ -155,7 +171,7 @@ def train(config: RunConfig, console: Console) -> dict[str, Any]:
         if data.in_file:
             console.print("The training data are read from a file; more --memory avoids it.")
         try:
-            _meta_train(config, learner, folder, console)
+            _meta_train(config, learner, folder, console, watch)
         except Diverged as error:
             raise Diverged(f"training diverged: {error}; {_way_on(folder)}") from None
         return _evaluate(config, learner, folder, split, best_behavior(dataset))
@@ -185,7 +201,13 @@ def default_folder(config: RunConfig) -> Path:
     return Path("runs") / config.env / name / f"seed-{config.seed}"
 
 
-def _meta_train(config: RunConfig, learner: Learner, folder: RunFolder, console: Console) -> None:
+def _meta_train(
+    config: RunConfig,
+    learner: Learner,
+    folder: RunFolder,
+    console: Console,
+    watch: Watch | None,
+) -> None:
     from ctmrl import runs
     from ctmrl.console import TrainingDisplay
     from ctmrl.loggers import open_loggers
@@ -219,6 +241,8 @@ def _meta_train(config: RunConfig, learner: Learner, folder: RunFolder, console:
             folder.append_metrics(row)
             loggers.log(learner.step, row)
             display.show(row)
+            if watch:
+                watch(row)
 
 
 def _training_return(config: RunConfig, learner: Learner) -> float:
@@ -264,13 +288,16 @@ class Choice:
     env: str = "point_robot_wind"
     method: str = "ctmrl"
     preset: str = "standard"
+    seed: int | None = None
+    seeds: tuple[int, ...] | None = None
+    workers: int | None = None
 
 
 def parse(arguments: list[str]) -> RunConfig:
     """Read the command line: which environment, method and preset decides all other defaults.
 
     Raises:
-        UsageError: an unknown environment or method.
+        UsageError: an unknown environment or method, or no telling which seeds are meant.
     """
     import difflib
 
@@ -278,10 +305,12 @@ def parse(arguments: list[str]) -> RunConfig:
     from ctmrl.errors import UsageError
     from ctmrl.methods import METHODS
     from ctmrl.presets import known_preset, preset
+    from ctmrl.seeds import check_seeds
     from meta_envs import resolve
 
     plain = [word for word in arguments if word not in ("-h", "--help")]
     choice, _ = tyro.cli(Choice, args=plain, return_unknown_args=True, prog="python -m ctmrl.train")
+    check_seeds(choice.seed, choice.seeds, choice.workers)
     try:
         env = resolve(choice.env).name
     except ValueError as error:
@@ -306,9 +335,14 @@ def main() -> None:
     from rich.console import Console
 
     from ctmrl.report import result_table
+    from ctmrl.seeds import train_seeds
 
     config = parse(sys.argv[1:])
     console = Console()
+    if config.seeds:
+        check(config)
+        folder = config.out or default_folder(config).parent
+        sys.exit(train_seeds(train, config, folder, console))
     record = train(config, console)
     console.print(result_table(record))
     path = config.out or default_folder(config)

@@ -55,9 +55,11 @@ def test_a_text_that_is_no_shard(text: str) -> None:
 
 
 def test_an_empty_shard() -> None:
-    sentence = "--shard 2/3 is empty: there are 2 groups of tasks, take n <= 2"
+    sentence = "--shard 2/3 is empty: of these tasks there are 2 groups, take n <= 2 or a smaller"
     with pytest.raises(ValueError, match=sentence):
         parse_shard("2/3", ((1, 2), (3,)))
+    with pytest.raises(ValueError, match="there is 1 group, take n <= 1"):
+        parse_shard("1/2", ((1, 2),))
 
 
 @pytest.mark.parametrize(
