@@ -61,6 +61,8 @@ def rows_text(tasks: Sequence[int]) -> str:
 def remake_command(index: Mapping[str, Any]) -> str:
     """The command that makes a dataset again, byte for byte, without its `--out`.
 
+    Of a fleet's shards or of several commands' tasks, the groups are those of one command for all.
+
     Args:
         index: content of `dataset.json`.
     """

@@ -21,6 +21,7 @@ from datagen.dataset import (
     read_task,
     task_of,
 )
+from datagen.job import STATE_FILES
 
 BESIDE = frozenset({INDEX_FILE, "README.md", "LICENSE", ".gitattributes"})
 """What may lie in a dataset's folder besides the task files of its index."""
@@ -120,6 +121,8 @@ def _strays(folder: Path, dataset: Dataset) -> Iterator[str]:
             continue
         if name.startswith(".") and name.endswith(".partial"):
             yield f"{path}: left by an interrupted writer; delete it if none is at work"
+        elif path.match(STATE_FILES):
+            yield f"{path}: an unfinished training of a fleet; finish the collection or delete it"
         elif task_of(path) is not None:
             yield f"{path}: no task of {INDEX_FILE}; finish the collection or delete it"
         else:

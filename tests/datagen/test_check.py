@@ -98,11 +98,14 @@ def test_an_edited_index_is_a_fault(folder: Path, capsys: Capture) -> None:
 def test_strays_are_warned_of_but_no_fault(folder: Path, capsys: Capture) -> None:
     shutil.copy(folder / "task_003.h5", folder / "task_009.h5")
     (folder / ".task_004.h5.123.partial").write_bytes(b"half")
+    (folder / ".fleet_004-006_ab.safetensors").write_bytes(b"half")
     (folder / "notes.txt").write_text("mine")
     code, out, err = run(capsys, folder)
     assert code == 0
     assert len(out) == 1
     assert err == [
+        f"warning: {folder / '.fleet_004-006_ab.safetensors'}: an unfinished training of a fleet; "
+        "finish the collection or delete it",
         f"warning: {folder / '.task_004.h5.123.partial'}: left by an interrupted writer; "
         "delete it if none is at work",
         f"warning: {folder / 'notes.txt'}: no part of the dataset",
