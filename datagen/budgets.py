@@ -152,7 +152,7 @@ _POINT_PAPER = Budget(
     episodes=50,
     reference_episodes=1_000,
     sac=_POINT_SAC,
-    fleet=FleetSettings(50, "auto"),
+    fleet=FleetSettings(25, "auto"),
 )
 _POINT_SMOKE = Budget(
     name="smoke",
@@ -162,7 +162,7 @@ _POINT_SMOKE = Budget(
     episodes=4,
     reference_episodes=100,
     sac=replace(_POINT_SAC, hidden=(16, 16), batch_size=32, update_every=10),
-    fleet=FleetSettings(50, "auto"),
+    fleet=FleetSettings(25, "auto"),
 )
 
 

@@ -74,7 +74,7 @@ def test_config_names_the_fleet_only_where_there_is_one() -> None:
     ("env", "fleet", "options"),
     [
         ("point_robot", None, ["--engine", "sb3"]),
-        ("point_robot", FleetSettings(50, "float32"), []),
+        ("point_robot", FleetSettings(25, "float32"), []),
         ("point_robot", FleetSettings(4, "float32"), ["--fleet-size", "4"]),
         ("ant-goal", None, ["--engine", "sb3"]),
         ("ant-goal", FleetSettings(25, "bfloat16"), []),

@@ -94,7 +94,7 @@ def fleet_index(env: str, fleet: FleetSettings | None) -> dict[str, Any]:
     ("env", "fleet", "options"),
     [
         ("point_robot_wind", None, "--engine sb3 "),
-        ("point_robot_wind", FleetSettings(50, "float32"), "--precision float32 "),
+        ("point_robot_wind", FleetSettings(25, "float32"), "--precision float32 "),
         ("point_robot_wind", FleetSettings(7, "bfloat16"), "--fleet-size 7 --precision bfloat16 "),
         ("hopper_params", FleetSettings(25, "bfloat16"), "--precision bfloat16 "),
         ("hopper_params", FleetSettings(3, "float32"), "--fleet-size 3 --precision float32 "),

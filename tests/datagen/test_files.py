@@ -176,8 +176,8 @@ def test_the_remedy_says_how_the_policies_were_trained() -> None:
 
     robot, hopper = "point_robot_wind", "hopper_params"
     assert options(robot, None, {}) == options(hopper, None, {}) == " --engine sb3"
-    assert options(robot, FleetSettings(50, "float32"), {}) == " --precision float32"
-    assert options(robot, FleetSettings(50, "float32", "cuda"), {}).endswith(" --device cuda")
+    assert options(robot, FleetSettings(25, "float32"), {}) == " --precision float32"
+    assert options(robot, FleetSettings(25, "float32", "cuda"), {}).endswith(" --device cuda")
     assert options(hopper, FleetSettings(25, "bfloat16"), {}) == " --precision bfloat16"
     thin = options(hopper, FleetSettings(9, "float32"), {"episodes": 1})
     assert thin == " --episodes 1 --fleet-size 9 --precision float32"

@@ -112,7 +112,7 @@ def test_either_engine_collects_point_robots(engine: str, tmp_path: Path, capsys
     assert main([*ROBOTS, "--engine", engine, *options, "--out", str(tmp_path)]) == 0
     dataset = open_dataset(tmp_path)
     assert dataset.tasks.tolist() == ([0, 1] if engine == "fleet" else [0])
-    fleet = {"size": 50, "precision": "float32", "device": "cpu"} if engine == "fleet" else None
+    fleet = {"size": 25, "precision": "float32", "device": "cpu"} if engine == "fleet" else None
     assert dataset.index["config"].get("fleet") == fleet
     assert len(dataset.read(0)) == 2 * 4 * 25
     assert check.main([str(tmp_path)]) == 0
