@@ -42,7 +42,7 @@ class Curves:
     """Folder for the datasets, outside the repository."""
     tasks: int = 10
     """Number of tasks, spread over the task set."""
-    steps: int = 12_000
+    steps: int = 20_000
     """Environment steps of each task, for MuJoCo environments; point robots have their budget's."""
     episodes: int = 10
     """Episodes of each checkpoint."""

@@ -246,8 +246,13 @@ def _collect(plan: Plan, console: Console) -> dict[str, Any]:
             f"all tasks are done, but not the index ({error}); the same command continues"
         ) from error
     states = {group_file(plan.folder, group).name for group in plan.groups}
-    remove_stale(plan.folder, states | {task_file(task) for task in plan.tasks})
-    remove_states(plan.folder)
+    try:
+        remove_stale(plan.folder, states | {task_file(task) for task in plan.tasks})
+        remove_states(plan.folder)
+    except OSError as error:
+        raise CollectionError(
+            f"the dataset is complete, but what its making left cannot be removed ({error})"
+        ) from error
     return index
 
 

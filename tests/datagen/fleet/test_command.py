@@ -314,3 +314,16 @@ def test_a_file_that_was_lost_is_made_again(hoppers: Path, tmp_path: Path) -> No
     (folder / "task_001.h5").unlink()
     assert main([*HOPPERS, "--out", str(folder)]) == 0
     assert contents(folder) == contents(hoppers)
+
+
+def test_what_cannot_be_removed_in_the_end_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(folder: Path) -> None:
+        raise PermissionError("not allowed")
+
+    monkeypatch.setattr("datagen.collect.remove_states", refuse)
+    few = ["--env", "point_robot_wind", "--budget", "smoke", "--tasks", "0-1", "--workers", "1"]
+    assert main([*few, "--out", str(tmp_path)]) == 1
+    assert "the dataset is complete, but" in capsys.readouterr().err
+    assert check.main([str(tmp_path)]) == 0
