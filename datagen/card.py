@@ -8,6 +8,7 @@ from typing import Any
 
 from datagen.budgets import other_options
 from datagen.columns import COLUMNS
+from datagen.groups import planned_groups, rows_text, trained_groups
 from meta_envs import resolve, task_set
 from meta_envs.registry import definition
 
@@ -47,31 +48,25 @@ def _settings_text(index: Mapping[str, Any]) -> tuple[str, ...]:
     return _FLEET_SETTINGS if "fleet" in index["config"] else _COLLECTION_SETTINGS
 
 
-def rows_text(tasks: Sequence[int]) -> str:
-    """Task numbers as `--tasks` takes them: [0, 1, 2, 5] is `0-2,5`."""
-    spans: list[list[int]] = []
-    for task in tasks:
-        if spans and task == spans[-1][1] + 1:
-            spans[-1][1] = task
-        else:
-            spans.append([task, task])
-    return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in spans)
+def remake_commands(index: Mapping[str, Any]) -> list[str]:
+    """The commands that make a dataset again, byte for byte, without their `--out`.
 
-
-def remake_command(index: Mapping[str, Any]) -> str:
-    """The command that makes a dataset again, byte for byte, without its `--out`.
-
-    Of a fleet's shards or of several commands' tasks, the groups are those of one command for all.
+    It is one, unless the groups of a fleet are not those of one command for all tasks, as where
+    shards are missing or tasks were added later: then it is one for each group.
 
     Args:
         index: content of `dataset.json`.
     """
     words = ["python", "-m", "datagen.collect", "--env", index["env"], "--budget", index["budget"]]
     words += other_options(index["env"], index["budget"], index["config"])
-    tasks = [record["task"] for record in index["tasks"]]
+    seed = ["--seed", str(index["seed"])]
+    trained, tasks = trained_groups(index), [record["task"] for record in index["tasks"]]
+    if trained != planned_groups(index):
+        groups = dict.fromkeys(trained.values())
+        return [shlex.join([*words, "--tasks", group, *seed]) for group in groups]
     if len(tasks) < len(task_set(index["env"])):
         words += ["--tasks", rows_text(tasks)]
-    return shlex.join([*words, "--seed", str(index["seed"])])
+    return [shlex.join([*words, *seed])]
 
 
 def named_checkpoints(record: Mapping[str, Any]) -> dict[str, str]:
@@ -178,7 +173,7 @@ def _about(index: Mapping[str, Any]) -> list[str]:
 
 
 def _collection_text(index: Mapping[str, Any]) -> list[str]:
-    config = index["config"]
+    config, commands = index["config"], remake_commands(index)
     marks = config["checkpoints"]
     return [
         "On each task one soft actor-critic was trained from scratch. At each of "
@@ -186,10 +181,11 @@ def _collection_text(index: Mapping[str, Any]) -> list[str]:
         f"stochastic policy played {config['episodes']} episodes. The data are a mixture of poor, "
         "middling and good behaviour.",
         "",
-        "Made again by this command, byte for byte with the versions below on a like processor:",
+        f"Made again by {'these commands' if len(commands) > 1 else 'this command'}, byte for byte "
+        "with the versions below on a like processor:",
         "",
         "```",
-        remake_command(index),
+        *commands,
         "```",
         "",
     ]

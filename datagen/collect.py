@@ -18,7 +18,6 @@ import tyro
 from rich.console import Console
 
 from datagen.budgets import Budget, budget
-from datagen.card import rows_text
 from datagen.dataset import task_file
 from datagen.estimate import seconds_of
 from datagen.finished import (
@@ -29,6 +28,7 @@ from datagen.finished import (
     without_versions,
     write_summary,
 )
+from datagen.groups import rows_text
 from datagen.job import Job, group_file, origin
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration

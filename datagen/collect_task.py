@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from datagen.dataset import TaskData, task_file, write_task
+from datagen.groups import rows_text
 from datagen.job import Job, Stream, origin
 from datagen.rollout import episode_returns, join, rollout
 from meta_envs import TaskSet, reference_returns, task_set
@@ -88,6 +89,8 @@ def collect_task(job: Job, report: Callable[[int], None] = lambda step: None) ->
         "split": "test" if job.task in tasks.test_tasks else "train",
         "returns": returns,
     }
+    if job.budget.fleet:
+        meta["group"] = rows_text(job.group)
     if job.policies is not None:
         # Before the task's file: once that is there, a task is done.
         _export(job, job.policies)

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from datagen.budgets import groups_of, other_options
+from datagen.budgets import other_options
+from datagen.groups import trained_groups
 from meta_envs import resolve
 
 INDEX_FILE = "dataset.json"
@@ -66,8 +67,8 @@ def collect_command(folder: Path, source: Mapping[str, Any], task: int | None = 
         source: an index or a task's `meta`, as far as known; its `env`, `budget` and `seed` are
             used, and its episodes where they are not the budget's own. Without a known `env` the
             folder's name is.
-        task: the one task to collect; all by default. Of a fleet's index it is the group it was
-            trained in, since only that gives the same bytes again.
+        task: the one task to collect; all by default. A fleet's is collected with the group it was
+            trained in, where that is known, since only that gives the same bytes again.
     """
     env = _short_name(source.get("env")) or _short_name(folder.absolute().name) or "ENVIRONMENT"
     if source.get("budget") == IMPORTED:
@@ -75,7 +76,7 @@ def collect_command(folder: Path, source: Mapping[str, Any], task: int | None = 
         return shlex.join([*words, "--out", str(folder)])
     words = ["python", "-m", "datagen.collect", "--env", env]
     if task is not None:
-        words += ["--tasks", ",".join(map(str, _trained_with(task, source)))]
+        words += ["--tasks", _trained_with(task, source)]
     for key in ("budget", "seed"):
         if isinstance(source.get(key), str | int):
             words += [f"--{key}", str(source[key])]
@@ -83,14 +84,12 @@ def collect_command(folder: Path, source: Mapping[str, Any], task: int | None = 
     return shlex.join([*words, "--out", str(folder)])
 
 
-def _trained_with(task: int, source: Mapping[str, Any]) -> tuple[int, ...]:
-    """The group of a fleet's task, where an index is known, or the task alone."""
+def _trained_with(task: int, source: Mapping[str, Any]) -> str:
+    """The group of a fleet's task, where an index or its own meta says it, or the task alone."""
     try:
-        tasks = [int(record["task"]) for record in source["tasks"]]
-        groups = groups_of(tasks, source["config"]["fleet"]["size"])
-        return next(group for group in groups if task in group)
-    except (KeyError, StopIteration, TypeError, ValueError):
-        return (task,)
+        return str(source["group"]) if "group" in source else trained_groups(source)[task]
+    except (KeyError, TypeError, ValueError):
+        return str(task)
 
 
 def _other_options(env: str, source: Mapping[str, Any]) -> list[str]:

@@ -17,6 +17,9 @@ from datagen.task_files import parse_task
 
 _PARTIAL = re.compile(r"\.(.+)\.([^.]*)\.(\d+)\.partial")
 
+_RECORDED = ("task", "split", "params", "returns", "group")
+"""Keys of a file's meta that its record in the index repeats, where they are there."""
+
 
 @dataclass(frozen=True)
 class Finished:
@@ -42,7 +45,7 @@ def read_finished(path: Path) -> Finished:
     content = read_bytes(path, "delete it")
     data = parse_task(path, content, {})
     record = {
-        **{key: data.meta[key] for key in ("task", "split", "params", "returns")},
+        **{key: data.meta[key] for key in _RECORDED if key in data.meta},
         "file": path.name,
         "bytes": len(content),
         "sha256": digest(content),

@@ -6,8 +6,8 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from typing import Protocol, TypeVar
 
-from datagen.card import rows_text
 from datagen.collect_task import collect_task
+from datagen.groups import rows_text
 from datagen.job import Job
 from datagen.plan import Plan
 from datagen.progress import CollectionDisplay

@@ -13,7 +13,7 @@ import pytest
 import tyro
 
 from datagen.budgets import FleetSettings, budget
-from datagen.card import card, mean_returns, named_checkpoints, remake_command, rows_text
+from datagen.card import card, mean_returns, named_checkpoints, remake_commands
 from datagen.collect import CollectConfig, plan_of
 from datagen.job import origin
 from tests.datagen.examples import index_of, write_dataset
@@ -68,20 +68,14 @@ def test_a_card_without_test_tasks(index: dict[str, Any]) -> None:
     assert "|  | train tasks |\n" in text
 
 
-@pytest.mark.parametrize(
-    ("tasks", "text"), [([0, 1, 2, 5], "0-2,5"), ([4], "4"), ([], ""), ([1, 3, 4], "1,3-4")]
-)
-def test_rows_text(tasks: list[int], text: str) -> None:
-    assert rows_text(tasks) == text
-
-
 def test_the_command_has_what_differs_from_the_defaults(index: dict[str, Any]) -> None:
     start = "python -m datagen.collect --env point_robot_wind --budget smoke"
-    assert remake_command(index) == f"{start} --engine sb3 --tasks 0-3 --seed 0"
+    assert remake_commands(index) == [f"{start} --engine sb3 --tasks 0-3 --seed 0"]
     every = [{"task": task} for task in range(50)]
-    assert remake_command({**index, "tasks": every, "seed": 4}) == f"{start} --engine sb3 --seed 4"
+    whole = {**index, "tasks": every, "seed": 4}
+    assert remake_commands(whole) == [f"{start} --engine sb3 --seed 4"]
     thin = {**index, "tasks": every, "config": {**index["config"], "episodes": 12}}
-    assert remake_command(thin) == f"{start} --episodes 12 --engine sb3 --seed 0"
+    assert remake_commands(thin) == [f"{start} --episodes 12 --engine sb3 --seed 0"]
 
 
 def fleet_index(env: str, fleet: FleetSettings | None) -> dict[str, Any]:
@@ -104,12 +98,30 @@ def fleet_index(env: str, fleet: FleetSettings | None) -> dict[str, Any]:
 def test_the_command_says_how_the_policies_were_trained(
     env: str, fleet: FleetSettings | None, options: str
 ) -> None:
-    command = remake_command(fleet_index(env, fleet))
+    (command,) = remake_commands(fleet_index(env, fleet))
     start = f"python -m datagen.collect --env {env} --budget smoke "
     assert command == f"{start}{options}--tasks 4-5 --seed 0"
     # And the command is understood, and means the same.
     config = tyro.cli(CollectConfig, args=shlex.split(command)[3:])
     assert plan_of(config).budget == replace(budget(env, "smoke"), fleet=fleet)
+
+
+def test_a_command_for_each_group_where_one_for_all_would_make_others() -> None:
+    index = fleet_index("hopper_params", FleetSettings(2, "float32"))
+    index["tasks"] = [{"task": task, "group": "3,6-7" if task > 2 else "1-2"} for task in (1, 2, 6)]
+    start = (
+        "python -m datagen.collect --env hopper_params --budget smoke --fleet-size 2 --precision"
+    )
+    ends = ("--tasks 1-2 --seed 0", "--tasks 3,6-7 --seed 0")
+    assert remake_commands(index) == [f"{start} float32 {end}" for end in ends]
+    index["tasks"][2]["group"] = "6"
+    assert remake_commands(index) == [f"{start} float32 --tasks {t} --seed 0" for t in ("1-2", "6")]
+    index["tasks"] = [
+        {"task": 1, "group": "1"},
+        {"task": 2, "group": "2-3"},
+        {"task": 3, "group": "2-3"},
+    ]
+    assert remake_commands(index) == [f"{start} float32 --tasks 1-3 --seed 0"]
 
 
 def test_a_fleets_settings_are_in_the_card(index: dict[str, Any]) -> None:

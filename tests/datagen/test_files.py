@@ -223,6 +223,8 @@ def test_a_task_of_a_fleet_is_collected_again_in_its_group() -> None:
     assert words[words.index("--tasks") + 1] == "5,7,9"
     assert words[words.index("--fleet-size") + 1] == "3"
     alone = {key: value for key, value in index.items() if key != "tasks"}
+    said = collect_command(Path("data"), {**alone, "group": "4-6"}, 5).split()
+    assert said[said.index("--tasks") + 1] == "4-6", "a file says its group itself"
     for source, task in ((alone, 5), (index, 4)):
         words = collect_command(Path("data"), source, task).split()
         assert words[words.index("--tasks") + 1] == str(task)

@@ -22,7 +22,7 @@ from stable_baselines3 import SAC
 
 from datagen import check
 from datagen.budgets import FleetSettings
-from datagen.card import remake_command
+from datagen.card import remake_commands
 from datagen.collect import CollectConfig, main, plan_of
 from datagen.dataset import open_dataset
 from datagen.fleet.networks import best_precision
@@ -68,6 +68,7 @@ def test_the_data_are_those_of_the_budget(hoppers: Path) -> None:
     }
     for task in range(3):
         data = dataset.read(task)
+        assert data.meta["group"] == dataset.entry(task)["group"] == "0-2"
         ends = np.flatnonzero(np.diff(data.episode, append=-1))
         assert data.checkpoint[ends].tolist() == [300] * 2 + [400] * 2
         assert (data.columns["terminals"] | data.columns["timeouts"])[ends].all()
@@ -75,7 +76,7 @@ def test_the_data_are_those_of_the_budget(hoppers: Path) -> None:
     rows = [dataset.read(task).actions[:5] for task in range(3)]
     assert not np.array_equal(rows[0], rows[1])
     card = (hoppers / "README.md").read_text()
-    assert f"{remake_command(dataset.index)}\n" in card
+    assert "\n".join(["```", *remake_commands(dataset.index), "```"]) in card
     assert f"--budget smoke --precision {best_precision()} --tasks 0-2 --seed 0" in card
 
 
