@@ -60,7 +60,7 @@ def evaluate_agent(
     """
     import torch
 
-    from ctmrl.meta_test import meta_test
+    from ctmrl.meta_test import MetaTest
     from meta_envs import normalized_score, reference_returns
 
     references = reference_returns(tasks)
@@ -80,8 +80,10 @@ def evaluate_agent(
     }
     if agent.method.note:
         record["note"] = agent.method.note
+    test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed)
+    results = test.run(groups)
     for name, rows in groups.items():
-        result = meta_test(agent.method.encoder, agent.actor, tasks, rows, config.meta_test, seed)
+        result = results[name]
         anchors = {key: float(values[rows].mean()) for key, values in references.items()}
         if best_behavior and all(int(row) in best_behavior for row in rows):
             best = [best_behavior[int(row)] for row in rows]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -46,23 +46,54 @@ class MetaTestResult(NamedTuple):
     contexts: NDArray[np.float32]
 
 
-class _Adaptation:
-    """Many tasks side by side in one vector environment, each with a context that grows."""
+Act = Callable[[Tensor], NDArray[np.float32]]
+"""Actions [n, A] for observations [n, O]."""
 
-    def __init__(self, env: MetaVectorEnv, encoder: Encoder, actor: Actor, seed: int) -> None:
-        self.env, self.encoder, self.actor = env, encoder, actor
-        self.dense = encoder.sees_dense_reward and env.definition.sparse
-        self.shape = env.action_space.shape or ()
-        self.params = torch.tensor(env.params, dtype=torch.float32)
-        self.noise = np.random.default_rng(seed)
-        self.generator = torch.Generator().manual_seed(seed)
-        self.total = torch.zeros(env.num_envs, encoder.z_dim, dtype=torch.float64)
-        self.count = torch.zeros(env.num_envs, 1, dtype=torch.float64)
-        env.reset(seed=seed)
+
+class _Seen(NamedTuple):
+    """What a step showed a group of n sub-environments.
+
+    Attributes:
+        obs: the observations after it, [n, O].
+        reward: what counts, [n].
+        read: the reward that goes into the context, [n].
+        over: whether the episode is, [n].
+    """
+
+    obs: NDArray[np.float32]
+    reward: Floats
+    read: Floats
+    over: NDArray[np.bool_]
+
+
+Episode = Generator[NDArray[np.float32], _Seen, Floats]
+"""Gives actions [n, A], is sent what they led to, and ends in returns [n]."""
+Protocol = Generator[NDArray[np.float32], _Seen, MetaTestResult]
+"""The same for all episodes of a group; ends in its result."""
+
+
+class _Adaptation:
+    """Tasks side by side in some rows of a vector environment, each with a context that grows.
+
+    Its random numbers, its environments and its batches for the networks are its own, so that what
+    the other rows hold does not change a bit of it.
+    """
+
+    def __init__(self, env: MetaVectorEnv, rows: slice, test: MetaTest) -> None:
+        self.env, self.rows, self.encoder, self.actor = env, rows, test.encoder, test.actor
+        self.mask = np.zeros(env.num_envs, dtype=np.bool_)
+        self.mask[rows] = True
+        self.params = torch.tensor(env.params[rows], dtype=torch.float32)
+        self.size = len(self.params)
+        self.shape = (self.size, *(env.single_action_space.shape or ()))
+        self.noise = np.random.default_rng(test.seed)
+        self.generator = torch.Generator().manual_seed(test.seed)
+        self.total = torch.zeros(self.size, self.encoder.z_dim, dtype=torch.float64)
+        self.count = torch.zeros(self.size, 1, dtype=torch.float64)
 
     @property
     def z(self) -> Tensor:
-        """What the policy is given: contexts so far, [num_envs, Z]; 0 before any transition."""
+        """What the policy is given: contexts so far, [n, Z]; 0 before any transition."""
         mean = (self.total / self.count.clamp_min(1.0)).float()
         return self.encoder.told(mean, self.params)
 
@@ -70,36 +101,125 @@ class _Adaptation:
         """Uniform actions."""
         return self.noise.uniform(-1.0, 1.0, self.shape).astype(np.float32)
 
-    def stochastic(self, z: Tensor) -> Callable[[Tensor], NDArray[np.float32]]:
+    def stochastic(self, z: Tensor) -> Act:
         """The policy's samples on fixed contexts."""
         return lambda obs: self.actor.sample(obs, z, self.generator).action.numpy()
 
-    def deterministic(self, z: Tensor) -> Callable[[Tensor], NDArray[np.float32]]:
+    def deterministic(self, z: Tensor) -> Act:
         """The policy's means on fixed contexts."""
         return lambda obs: self.actor.act(obs, z).numpy()
 
-    def episode(self, act: Callable[[Tensor], NDArray[np.float32]], explore: bool) -> Floats:
-        """Returns [num_envs] of one episode each; `explore` adds its transitions to the context."""
-        obs, _ = self.env.reset()
-        running = np.ones(self.env.num_envs, dtype=np.bool_)
-        returns = np.zeros(self.env.num_envs)
+    def episode(self, act: Act, explore: bool) -> Episode:
+        """Returns [n] of one episode each; `explore` adds its transitions to the context."""
+        obs = self.env.reset(options={"reset_mask": self.mask})[0][self.rows]
+        running = np.ones(self.size, dtype=np.bool_)
+        returns = np.zeros(self.size)
         while running.any():
             action = act(torch.from_numpy(obs))
-            next_obs, reward, terminated, truncated, info = self.env.step(action)
-            returns += np.where(running, reward, 0.0)
+            seen = yield action
+            returns += np.where(running, seen.reward, 0.0)
             if explore:
-                seen = info["dense_reward"] if self.dense else reward
-                rows = (obs, action, seen[:, None].astype(np.float32), next_obs)
+                rows = (obs, action, seen.read[:, None].astype(np.float32), seen.obs)
                 encoded = self.encoder.encode(torch.from_numpy(np.concatenate(rows, axis=1)))
                 keep = torch.from_numpy(running)[:, None]
                 self.total += torch.where(keep, encoded.double(), 0.0)
                 self.count += keep
-            running &= ~(terminated | truncated)
-            obs = next_obs
+            running &= ~seen.over
+            obs = seen.obs
         return returns
 
+    def score(self) -> Episode:
+        """Returns [n] of one deterministic episode on the contexts so far."""
+        return self.episode(self.deterministic(self.z), explore=False)
 
-@torch.no_grad()
+    def protocol(self, config: MetaTestConfig) -> Protocol:
+        """The whole adaptation."""
+        curve = []
+        for episode in range(config.random_episodes + config.policy_episodes):
+            curve.append((yield from self.score()))
+            if episode < config.random_episodes:
+                yield from self.episode(self.random, explore=True)
+            else:
+                yield from self.episode(self.stochastic(self.z), explore=True)
+        last = []
+        for _ in range(config.scored_episodes):
+            last.append((yield from self.score()))
+        scored = np.mean(last, axis=0)
+        curve.append(scored)
+        shape = (config.repetitions, self.size // config.repetitions)
+        return MetaTestResult(
+            scored.reshape(shape),
+            np.stack(curve).reshape(-1, *shape).mean(axis=1),
+            self.z.numpy().reshape(*shape, -1),
+        )
+
+
+@dataclass(frozen=True)
+class MetaTest:
+    """A meta-test of any groups of tasks, all side by side in one vector environment.
+
+    Attributes:
+        encoder: makes contexts from transitions.
+        actor: acts on contexts.
+        tasks: the task set.
+        config: the protocol.
+        seed: of random actions, policy noise and the environments, in each group anew.
+        threads: that step the environments; as many as there are by default. No number depends on
+            them.
+    """
+
+    encoder: Encoder
+    actor: Actor
+    tasks: TaskSet
+    config: MetaTestConfig
+    seed: int
+    threads: int | None = None
+
+    @torch.no_grad()
+    def run(
+        self,
+        groups: Mapping[str, NDArray[np.int64]],
+        each_step: Callable[[], None] | None = None,
+    ) -> dict[str, MetaTestResult]:
+        """Adapt to each task of some groups and score it; the results by the groups' names.
+
+        A group goes through its episodes at its own pace. Its result is what it would be without
+        the others, bit for bit.
+
+        Args:
+            groups: rows of the task set by name.
+            each_step: called before each step; what it raises ends the meta-test.
+        """
+        rows = {name: np.tile(own, self.config.repetitions) for name, own in groups.items()}
+        every = np.concatenate([*rows.values()])
+        env = MetaVectorEnv(self.tasks.env, tasks=every, task_set=self.tasks, threads=self.threads)
+        env.reset(seed=[self.seed + place for own in rows.values() for place in range(len(own))])
+        dense = self.encoder.sees_dense_reward and env.definition.sparse
+        actions = np.zeros(env.action_space.shape or (), dtype=np.float32)
+        at_work: list[tuple[str, slice, Protocol]] = []
+        for name, own in rows.items():
+            begin = at_work[-1][1].stop if at_work else 0
+            place = slice(begin, begin + len(own))
+            protocol = _Adaptation(env, place, self).protocol(self.config)
+            actions[place] = next(protocol)
+            at_work.append((name, place, protocol))
+        results: dict[str, MetaTestResult] = {}
+        while len(results) < len(groups):
+            if each_step is not None:
+                each_step()
+            obs, reward, terminated, truncated, info = env.step(actions)
+            read, over = info["dense_reward"] if dense else reward, terminated | truncated
+            for name, place, protocol in at_work:
+                if name in results:
+                    continue
+                seen = _Seen(obs[place], reward[place], read[place], over[place])
+                try:
+                    actions[place] = protocol.send(seen)
+                except StopIteration as stop:
+                    results[name] = stop.value
+        return {name: results[name] for name in groups}
+
+
 def meta_test(
     encoder: Encoder,
     actor: Actor,
@@ -108,35 +228,5 @@ def meta_test(
     config: MetaTestConfig,
     seed: int,
 ) -> MetaTestResult:
-    """Adapt to each task and score it, all tasks and repetitions side by side.
-
-    Args:
-        encoder: makes contexts from transitions.
-        actor: acts on contexts.
-        tasks: the task set.
-        rows: n tasks of it.
-        config: the protocol.
-        seed: of random actions, policy noise and the environments.
-    """
-    repetitions = config.repetitions
-    env = MetaVectorEnv(tasks.env, tasks=np.tile(rows, repetitions), task_set=tasks)
-    adaptation = _Adaptation(env, encoder, actor, seed)
-
-    def score() -> Floats:
-        return adaptation.episode(adaptation.deterministic(adaptation.z), explore=False)
-
-    curve = []
-    for episode in range(config.random_episodes + config.policy_episodes):
-        curve.append(score())
-        if episode < config.random_episodes:
-            adaptation.episode(adaptation.random, explore=True)
-        else:
-            adaptation.episode(adaptation.stochastic(adaptation.z), explore=True)
-    scored = np.mean([score() for _ in range(config.scored_episodes)], axis=0)
-    curve.append(scored)
-    shape = (repetitions, len(rows))
-    return MetaTestResult(
-        scored.reshape(shape),
-        np.stack(curve).reshape(-1, *shape).mean(axis=1),
-        adaptation.z.numpy().reshape(*shape, -1),
-    )
+    """The meta-test of one group of tasks; see `MetaTest` for the arguments."""
+    return MetaTest(encoder, actor, tasks, config, seed).run({"": rows})[""]

@@ -143,6 +143,20 @@ def mistake(capsys: pytest.CaptureFixture[str], run: Path, **options: Any) -> st
     return captured.err.removeprefix("error: ").strip()
 
 
+def test_a_group_alone_has_the_record_it_has_beside_others(
+    finished_run: FinishedRun, agent: Agent
+) -> None:
+    record = read_json(finished_run.path / "evaluation.json")
+    config = config_from_settings(read_json(finished_run.path / "config.json"), Path())
+    tasks = task_set("point_robot_wind")
+    for name, group in record["groups"].items():
+        rows = {name: np.array(group["tasks"])}
+        alone = evaluate_agent(agent, config, tasks, rows, {}, 0)["groups"][name]
+        # The best behaviour is the dataset's, which is not given here.
+        alone["references"]["best_behavior"] = group["references"].get("best_behavior")
+        assert json.loads(json.dumps(alone)) == group | {"references": alone["references"]}
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

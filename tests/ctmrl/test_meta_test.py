@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ctmrl.data import OfflineData
-from ctmrl.meta_test import MetaTestConfig, MetaTestResult, meta_test
+from ctmrl.meta_test import MetaTest, MetaTestConfig, MetaTestResult, meta_test
 from ctmrl.networks import Actor, ContextEncoder
 from meta_envs import ENVIRONMENTS, MetaEnv, TaskSet, task_set
 
@@ -256,3 +256,74 @@ def test_nothing_is_learnt_and_no_shared_generator_is_touched(
     ):
         assert parameter.equal(weight)
         assert parameter.grad is None
+
+
+def networks(env: str) -> tuple[ContextEncoder, Actor]:
+    """Networks for an environment, so small that the batch they are given shows in last bits."""
+    alone = MetaEnv(env)
+    (obs,), (act,) = alone.observation_space.shape or (), alone.action_space.shape or ()
+    ones = torch.ones(2 * obs + act + 1)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        encoder = ContextEncoder((0.1 * ones, 0.5 * ones), obs, (11,), Z)
+        actor = Actor((torch.zeros(obs), torch.ones(obs)), Z, (13,), act)
+    with torch.no_grad():
+        # Over the edge where the noisy robot's episodes end.
+        [*actor.parameters()][-1][0] += 0.5
+    return encoder, actor
+
+
+def same(one: MetaTestResult, other: MetaTestResult) -> bool:
+    return all(
+        np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in zip(one, other, strict=True)
+    )
+
+
+def counted(
+    test: MetaTest, groups: dict[str, NDArray[np.int64]]
+) -> tuple[dict[str, MetaTestResult], int]:
+    """The results, and how many steps they took."""
+    steps: list[None] = []
+    return test.run(groups, lambda: steps.append(None)), len(steps)
+
+
+@pytest.mark.parametrize("env", ["point_robot_wind", "noisy_robot", "hopper_params"])
+def test_a_group_beside_others_is_what_it_is_alone(
+    env: str, request: pytest.FixtureRequest
+) -> None:
+    if env == "noisy_robot":
+        request.getfixturevalue("noisy_robot")
+    test = MetaTest(*networks(env), task_set(env), PROTOCOL, SEED)
+    groups = {"few": ROWS, "one": np.array([3]), "many": np.array([9, 4, 1, 2, 8, 0, 7])}
+    alone, lengths = {}, {}
+    for name, rows in groups.items():
+        found, lengths[name] = counted(test, {name: rows})
+        alone |= found
+    for threads in (1, 2, 2):
+        beside, steps = counted(dataclasses.replace(test, threads=threads), groups)
+        assert [*beside] == [*groups]
+        for name in groups:
+            assert same(beside[name], alone[name]), name
+        # One pass: nobody waits for another's episodes.
+        assert steps == max(lengths.values())
+        groups = dict(reversed(groups.items()))
+    early = env != "point_robot_wind"
+    assert len(set(lengths.values())) == (3 if early else 1), lengths
+    # That any of it could have differed:
+    assert not same(alone["few"], dataclasses.replace(test, seed=SEED + 1).run(groups)["few"])
+    few, many = ([*groups[name]].index(4) for name in ("few", "many"))
+    assert alone["few"].returns[0, few] != alone["many"].returns[0, many]
+
+
+def test_what_is_called_before_each_step_can_end_it(encoder: CountingEncoder, actor: Actor) -> None:
+    left = [None] * 30
+
+    def count() -> None:
+        left.pop()
+
+    test = MetaTest(encoder, actor, task_set("point_robot_wind"), PROTOCOL, SEED)
+    with pytest.raises(IndexError):
+        test.run({"some": ROWS}, count)
+    # The first episode of 25 steps is scored, and five steps explore.
+    assert len(encoder.given) == 5
+    assert torch.is_grad_enabled()
