@@ -6,7 +6,7 @@ Whole steps with sampling and optimisers, on random numbers in the shape of the 
 field's settings on HalfCheetahVel, and those of `python -m ctmrl.train` without an argument; before
 the codebook is placed and with it. One run of one or two threads, and two seeds side by side, one
 thread each, whose rates add up. Sides take turns; a ratio is taken within one turn, so that a busy
-machine slows both sides of it.
+machine slows both sides of it. The precision is that of ours; the plain side is in float32 always.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -33,9 +33,11 @@ from ctmrl.config import RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.meta_train import Learner
 from ctmrl.methods.ctmrl import CTMRL
+from ctmrl.precision import Precision
 from ctmrl.presets import preset
 from ctmrl.synthetic import synthetic_dataset
 from ctmrl.threads import settle_threads
+from datagen.accelerator import check_precision
 
 EPISODES = 20
 """Of each task's random numbers."""
@@ -52,6 +54,8 @@ Engine = Literal["ours", "plain"]
 class Benchmark:
     """Measure gradient steps a second, ours against a plain implementation."""
 
+    precision: Literal["auto", "float32", "bfloat16"] = "float32"
+    """Of our matrix products; the plain implementation's are float32."""
     cases: tuple[str, ...] = ("half_cheetah_vel paper", "point_robot_wind standard")
     """Environment and settings."""
     repetitions: int = 7
@@ -69,6 +73,7 @@ class Result:
     case: str
     codebook: bool
     arrangement: str
+    precision: str
     repetitions: int
     ours: float
     """Steps a second, all processes together."""
@@ -88,31 +93,40 @@ def settings(case: str, seed: int) -> RunConfig:
     return replace(config, training=replace(config.training, context_episodes=5))
 
 
-def build(engine: Engine, case: str, codebook: bool, seed: int) -> Callable[[], object]:
+class Task(NamedTuple):
+    """What a process builds: a learner of an engine, but for its seed."""
+
+    engine: Engine
+    case: str
+    codebook: bool
+    precision: Precision
+
+
+def build(task: Task, seed: int) -> Callable[[], object]:
     """A learner's gradient step."""
-    config = settings(case, seed)
+    config = replace(settings(task.case, seed), precision=task.precision)
     dataset = synthetic_dataset(config.env, EPISODES)
     data = OfflineData(dataset, dataset.train_tasks)
-    if engine == "ours":
+    if task.engine == "ours":
         ours = Learner(config, data)
         assert isinstance(ours.method, CTMRL)
         # Few steps are taken, so the schedule does not get to place it.
-        ours.method.codebook.placed.fill_(codebook)
+        ours.method.codebook.placed.fill_(task.codebook)
         return ours.update
     torch.manual_seed(seed)
     statistics = data.statistics(config.context.next_obs_in_context)
     plain = PlainLearner(config, [dataset.read(int(t)) for t in dataset.train_tasks], statistics)
-    plain.with_codebook = codebook
+    plain.with_codebook = task.codebook
     return plain.update
 
 
-def serve(pipe: Connection, engine: Engine, case: str, codebook: bool, seed: int) -> None:
+def serve(pipe: Connection, task: Task, seed: int) -> None:
     """One process: answers (threads, seconds) with steps a second of that time."""
-    if engine == "ours":
+    if task.engine == "ours":
         settle_threads(1)
     else:
         torch.set_num_threads(1)
-    step = build(engine, case, codebook, seed)
+    step = build(task, seed)
     step()
     pipe.send(0.0)
     while True:
@@ -128,14 +142,13 @@ def serve(pipe: Connection, engine: Engine, case: str, codebook: bool, seed: int
 class Side:
     """Two processes of an engine."""
 
-    def __init__(self, engine: Engine, case: str, codebook: bool) -> None:
+    def __init__(self, task: Task) -> None:
         """Start them and wait until both have taken a step."""
         context = multiprocessing.get_context("spawn")
         self._members = []
         for seed in (0, 1):
             pipe, end = context.Pipe()
-            arguments = (end, engine, case, codebook, seed)
-            process = context.Process(target=serve, args=arguments, daemon=True)
+            process = context.Process(target=serve, args=(end, task, seed), daemon=True)
             process.start()
             end.close()
             self._members.append((process, pipe))
@@ -158,8 +171,10 @@ class Side:
 
 def measure(case: str, codebook: bool, options: Benchmark) -> list[Result]:
     """All arrangements of a case."""
+    precision = check_precision(options.precision, "cpu")
     with ExitStack() as stack:
-        ours, plain = Side("ours", case, codebook), Side("plain", case, codebook)
+        ours = Side(Task("ours", case, codebook, precision))
+        plain = Side(Task("plain", case, codebook, precision))
         stack.callback(ours.close)
         stack.callback(plain.close)
         results = []
@@ -177,6 +192,7 @@ def measure(case: str, codebook: bool, options: Benchmark) -> list[Result]:
                     case,
                     codebook,
                     name,
+                    precision,
                     options.repetitions,
                     ours_rate,
                     plain_rate,

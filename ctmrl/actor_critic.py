@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ctmrl import brac
 from ctmrl.data import Transitions
-from ctmrl.networks import Actor, Critic, Statistics
+from ctmrl.networks import Actor, Critic, Statistics, frozen
 
 
 @dataclass(frozen=True)
@@ -106,10 +106,11 @@ class ActorCritic(nn.Module):
             Scalar sum of the losses, and scalars by metric name.
         """
         target = self.critic_target(batch, z)
-        at_data = self.critic(batch.obs, batch.action, z)
+        layers = self.critic.layers()
+        at_data = self.critic(batch.obs, batch.action, z, layers=layers)
         critic = (at_data - target).square().mean(dim=1).sum()
         sample = self.actor.sample(batch.obs, z, generator)
-        q = self.critic(batch.obs, sample.action, z, frozen=True).amin(dim=0)
+        q = self.critic(batch.obs, sample.action, z, layers=frozen(layers)).amin(dim=0)
         entropy_cost = self.entropy_coef * sample.log_prob
         value = (self.value(batch.obs, z)[0] - (q - entropy_cost).detach()).square().mean()
         regularizer = sample.mean.square().mean() + sample.log_std.square().mean()
@@ -153,8 +154,9 @@ class ActorCritic(nn.Module):
         )
 
     def _divergence(self, batch: Transitions, z: Tensor, action: Tensor) -> Tensor:
-        at_policy = self.dual_critic(batch.obs, action, z, frozen=True)[0]
-        at_data = self.dual_critic(batch.obs, batch.action, z, frozen=True)[0]
+        layers = frozen(self.dual_critic.layers())
+        at_policy = self.dual_critic(batch.obs, action, z, layers=layers)[0]
+        at_data = self.dual_critic(batch.obs, batch.action, z, layers=layers)[0]
         return brac.dual_divergence(at_policy, at_data)
 
     def _update_dual(
@@ -164,15 +166,16 @@ class ActorCritic(nn.Module):
         between_action = action + share * (batch.action - action)
         use_gradient = self.config.dual_penalty == "gradient"
         between_action.requires_grad_(use_gradient)
-        between = self.dual_critic(batch.obs, between_action, z)[0]
+        layers = self.dual_critic.layers()
+        between = self.dual_critic(batch.obs, between_action, z, layers=layers)[0]
         penalty = (
             brac.gradient_penalty(between, between_action)
             if use_gradient
             else brac.value_penalty(between)
         )
         divergence = brac.dual_divergence(
-            self.dual_critic(batch.obs, action, z)[0],
-            self.dual_critic(batch.obs, batch.action, z)[0],
+            self.dual_critic(batch.obs, action, z, layers=layers)[0],
+            self.dual_critic(batch.obs, batch.action, z, layers=layers)[0],
         )
         loss = brac.dual_critic_loss(divergence, penalty)
         assert self.dual_optimizer is not None

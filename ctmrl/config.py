@@ -15,6 +15,7 @@ from ctmrl.methods.base import MethodConfig
 from datagen.dataset import Quality
 
 Preset = Literal["standard", "paper", "smoke"]
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,10 @@ class RunConfig:
     """Throw away what the run folder holds and begin anew."""
     threads: int = 1
     """Threads of the numerical libraries; part of what makes a run repeatable."""
+    precision: Precision = "float32"
+    """Of the networks' matrix products in meta-training; all else, and every measured return, is
+    float32. auto is bfloat16 where the hardware has units for it (AMX, most GPUs) and float32
+    elsewhere; a run goes on in the precision it began with. The MuJoCo robots' default is auto."""
     memory: float | None = None
     """GB of memory the training data may take as a table; default half of what is available. A
     larger table is read from a file beside the run, which ends with the process and changes no

@@ -13,7 +13,9 @@ from ctmrl.codebook import SHARE
 from ctmrl.config import MetaTrainConfig, RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.methods.base import Dimensions
+from ctmrl.precision import products_in
 from ctmrl.soundness import check_sound, q_limit
+from datagen.accelerator import check_precision
 
 LARGEST_Q = "policy/q_largest"
 """The metric that is a maximum over steps; the others are means."""
@@ -26,6 +28,7 @@ class Learner:
 
     Attributes:
         step: gradient steps taken.
+        precision: of the networks' matrix products in a step.
         method: the context-learning method.
         actor_critic: the actor-critic.
         optimizers: every optimiser by name; each parameter is in exactly one.
@@ -40,6 +43,7 @@ class Learner:
         self.config: MetaTrainConfig = config.training
         self.data = data
         self.step = 0
+        self.precision = check_precision(config.precision, "cpu")
         statistics = data.statistics(config.context.next_obs_in_context)
         dims = Dimensions(data.obs_dim, data.act_dim, len(data), config.training.steps)
         with torch.random.fork_rng():
@@ -119,12 +123,13 @@ class Learner:
         tasks = self._draw_tasks(self.generator)
         contexts = self._draw(tasks, method.context_sets)
         batch = self.data.transitions(tasks, config.batch_size, self.generator)
-        z = method.encoder(contexts)
-        context_loss, metrics = method.context_loss(contexts, z, self.generator)
-        # The first set's contexts, detached: the actor-critic must not train the encoder.
-        given = method.encoder.told(z[0].detach(), self.data.params[tasks])
-        repeated = given.repeat_interleave(config.batch_size, dim=0)
-        policy_loss, more = self.actor_critic.loss(batch, repeated, self.generator)
+        with products_in(self.precision):
+            z = method.encoder(contexts)
+            context_loss, metrics = method.context_loss(contexts, z, self.generator)
+            # The first set's contexts, detached: the actor-critic must not train the encoder.
+            given = method.encoder.told(z[0].detach(), self.data.params[tasks])
+            repeated = given.repeat_interleave(config.batch_size, dim=0)
+            policy_loss, more = self.actor_critic.loss(batch, repeated, self.generator)
         self._page_in()
         self.optimizers["main"].zero_grad()
         (context_loss + policy_loss).backward()  # type: ignore[no-untyped-call]

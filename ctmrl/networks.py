@@ -9,6 +9,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
+
+from ctmrl.precision import lowered
 
 LOG_STD_RANGE = (-20.0, 0.0)
 """Bounds of the policy's log standard deviation, as in the field's code since FOCAL."""
@@ -18,13 +21,27 @@ BLOCK = 1024
 processor's second cache, which makes 4096 rows a tenth faster to a fifth."""
 
 
-def mlp(in_dim: int, hidden: tuple[int, ...], out_dim: int) -> nn.Sequential:
+class MLP(nn.Sequential):
+    """Layers whose matrix products are of the precision that is set; what goes in comes out."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[*, in] -> [*, out], of the same type."""
+        h = lowered(x)
+        for layer in self:
+            if isinstance(layer, nn.Linear):
+                h = functional.linear(h, lowered(layer.weight), lowered(layer.bias))
+            else:
+                h = layer(h)
+        return h.to(x.dtype)
+
+
+def mlp(in_dim: int, hidden: tuple[int, ...], out_dim: int) -> MLP:
     """ReLU network [*, in_dim] -> [*, out_dim]."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [nn.Linear(in_dim, width), nn.ReLU(inplace=True)]
         in_dim = width
-    return nn.Sequential(*layers, nn.Linear(in_dim, out_dim))
+    return MLP(*layers, nn.Linear(in_dim, out_dim))
 
 
 class Standardize(nn.Module):
@@ -186,6 +203,15 @@ class Actor(nn.Module):
         return torch.tanh(self(obs, z)[0])
 
 
+Layers = list[tuple[Tensor, Tensor]]
+"""Weight [heads, in, out] and bias [heads, 1, out] of each layer of a critic."""
+
+
+def frozen(layers: Layers) -> Layers:
+    """The same layers, but gradients reach the inputs alone."""
+    return [(weight.detach(), bias.detach()) for weight, bias in layers]
+
+
 class Critic(nn.Module):
     """One or two scalar functions of (s, z) or (s, a, z), evaluated as one batched network."""
 
@@ -207,24 +233,33 @@ class Critic(nn.Module):
             self.weights.append(torch.stack([layer.weight.detach().T for layer in layers]))
             self.biases.append(torch.stack([layer.bias.detach()[None] for layer in layers]))
 
-    def forward(self, obs: Tensor, *others: Tensor, frozen: bool = False) -> Tensor:
+    def layers(self) -> Layers:
+        """The parameters as the matrix products take them."""
+        pairs = zip(self.weights, self.biases, strict=True)
+        return [(lowered(weight), lowered(bias)) for weight, bias in pairs]
+
+    def forward(self, obs: Tensor, *others: Tensor, layers: Layers | None = None) -> Tensor:
         """Values [heads, n] of observations [n, O] and what stands beside them, each [n, D].
 
-        With `frozen`, gradients reach the inputs but not the weights.
+        Args:
+            obs: observations.
+            *others: actions and contexts.
+            layers: this critic's `layers`, which calls may share; perhaps `frozen`.
         """
+        layers = layers or self.layers()
         x = torch.cat([self.standardize(obs), *others], dim=-1)
-        return torch.cat([self._values(rows, frozen) for rows in torch.split(x, BLOCK)], dim=1)
+        blocks = [_values(rows, layers) for rows in torch.split(lowered(x), BLOCK)]
+        return torch.cat(blocks, dim=1).to(x.dtype)
 
-    def _values(self, x: Tensor, frozen: bool) -> Tensor:
-        h = x.expand(len(self.weights[0]), *x.shape)
-        last = len(self.weights) - 1
-        for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if frozen:
-                weight, bias = weight.detach(), bias.detach()
-            h = torch.baddbmm(bias, h, weight)
-            if index < last:
-                h = torch.relu_(h)
-        return h[..., 0]
+
+def _values(x: Tensor, layers: Layers) -> Tensor:
+    """Values [heads, n] of inputs [n, in]."""
+    h = x.expand(len(layers[0][0]), *x.shape)
+    for index, (weight, bias) in enumerate(layers):
+        h = torch.baddbmm(bias, h, weight)
+        if index < len(layers) - 1:
+            h = torch.relu_(h)
+    return h[..., 0]
 
 
 class Predictors(nn.Module):

@@ -11,6 +11,7 @@ from ctmrl.config import MetaTrainConfig, Preset, RunConfig
 from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
+from ctmrl.runs import LATER_SETTINGS
 
 Settings = dict[str, Any]
 """Options by name, where they are not the defaults of their dataclasses."""
@@ -54,6 +55,7 @@ PAPER_GOAL = PAPER | {"context_size": 1024, "context_episodes": 51}
 PAPER_WIND = PAPER | {"context_size": 256, "context_episodes": 10}
 PAPER_ROBOT = PAPER | {
     "steps": 105_000,
+    "precision": "auto",
     # As many as every budget but smoke has of two contexts.
     "context_episodes": 50,
     "gamma": 0.99,
@@ -97,6 +99,7 @@ SQUARED: Settings = {"squared_errors": True}
 # Sized for a small machine, not searched yet.
 ROBOT: Settings = {
     "steps": 10_000,
+    "precision": "auto",
     "batch_size": 64,
     "context_size": 128,
     "encoder_hidden": (128, 128),
@@ -185,7 +188,7 @@ def preset(env: str, method: str, name: Preset, **changes: Any) -> RunConfig:
         env=env,
         method=method,
         preset=name,
-        **changes,
+        **({"precision": chosen.get("precision", "float32")} | changes),
     )
 
 
@@ -206,7 +209,7 @@ def config_from_settings(stored: dict[str, Any], path: Path) -> RunConfig:
         UsageError: the file does not fit this version of the package.
     """
     try:
-        settings = stored["settings"]
+        settings = LATER_SETTINGS | stored["settings"]
         base = preset(settings["env"], settings["method"], settings["preset"])
         restored: RunConfig = _restored(base, settings)
         return restored

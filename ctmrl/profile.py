@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import tyro
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ctmrl.config import RunConfig
     from ctmrl.data import OfflineData
     from ctmrl.meta_train import Learner
+    from ctmrl.precision import Precision
     from datagen.dataset import Dataset
 
 REST = "everything else"
@@ -47,7 +48,8 @@ class ProfileConfig:
     The settings are those python -m ctmrl.train would use. The codebook is in use, as it is for
     most of a run; K-means, which runs once in hundreds of steps, is not measured. Without a dataset
     random numbers of its shape are used, which takes the same time. The peak is that of a large
-    matrix product, measured with the same threads; only the FLOPs of matrix products are counted.
+    matrix product, measured with the same threads in the same precision; only the FLOPs of matrix
+    products are counted.
     """
 
     env: str = "point_robot_wind"
@@ -60,6 +62,8 @@ class ProfileConfig:
     """Gradient steps to measure; the table has the mean of the faster half of them."""
     threads: int = 1
     """Threads of the numerical libraries."""
+    precision: Literal["auto", "float32", "bfloat16"] | None = None
+    """Of the networks' matrix products; default that of python -m ctmrl.train."""
     data: Path | None = None
     """Dataset folder; default datasets/<environment>."""
     trace: Path | None = None
@@ -209,11 +213,12 @@ def measure(learner: Learner, steps: int) -> dict[str, Part]:
     }
 
 
-def peak_flops() -> float:
-    """FLOPs a second of a large float32 matrix product, with as many threads as are set."""
+def peak_flops(precision: Precision = "float32") -> float:
+    """FLOPs a second of a large matrix product, with as many threads as are set."""
     import torch
 
     a = torch.randn(PEAK_SIZE, PEAK_SIZE, generator=torch.Generator().manual_seed(0))
+    a = a.to(getattr(torch, precision))
     out, best = torch.empty_like(a), float("inf")
     for _ in range(PEAK_TIMES):
         start = time.perf_counter()
@@ -279,6 +284,8 @@ def profile(options: ProfileConfig, console: Console) -> None:
     if options.trace is not None and not options.trace.absolute().parent.is_dir():
         raise UsageError(f"--trace {options.trace}: there is no folder {options.trace.parent}")
     words = ["--env", options.env, "--method", options.method, "--preset", options.preset]
+    if options.precision is not None:
+        words += ["--precision", options.precision]
     config = dataclasses.replace(parse(words), data=options.data, threads=options.threads)
     # So long a run that neither K-means nor the end of it falls into the steps measured.
     training = dataclasses.replace(config.training, steps=1_000_000 + options.steps)
@@ -287,13 +294,13 @@ def profile(options: ProfileConfig, console: Console) -> None:
     if isinstance(codebook := getattr(learner.method, "codebook", None), torch.nn.Module):
         codebook.placed.fill_(True)  # type: ignore[operator]
     parts = measure(learner, options.steps)
-    peak = peak_flops()
+    peak = peak_flops(learner.precision)
     console.print(table_of(parts, peak))
     threads = f"{options.threads} thread" + "s" * (options.threads > 1)
     console.print(
         f"{config.env}, {config.method}, {config.preset}: "
         f"{1 / sum(part.seconds for part in parts.values()):.1f} steps/s; "
-        f"peak {peak / 1e9:.0f} GFLOP/s in float32, {threads}.",
+        f"peak {peak / 1e9:.0f} GFLOP/s in {learner.precision}, {threads}.",
         soft_wrap=True,
         highlight=False,
     )

@@ -40,7 +40,11 @@ RUN_FILES = (
 )
 """All that a run's folder holds, in an order in which any beginning may be missing."""
 
-LATER_SETTINGS: dict[str, Any] = {"quality": "mixed", "data_episodes": None}
+LATER_SETTINGS: dict[str, Any] = {
+    "quality": "mixed",
+    "data_episodes": None,
+    "precision": "float32",
+}
 """Settings that came after the first runs, and what a run has that does not name them. Where they
 are this, config.json leaves them out: such a run is the same in every version, byte for byte."""
 
@@ -106,6 +110,17 @@ def fitting(path: Path) -> Iterator[None]:
         raise RunError(
             f"{path} does not fit its run ({reason}): train again with --restart"
         ) from None
+
+
+def begun_with(path: Path, name: str) -> Any:
+    """A setting of the run that a folder holds; None where it holds none.
+
+    Raises:
+        RunError: what it holds cannot be read.
+    """
+    config = path / CONFIG
+    settings = read_json(config).get("settings") if config.exists() else None
+    return (LATER_SETTINGS | settings).get(name) if isinstance(settings, dict) else None
 
 
 class RunFolder:

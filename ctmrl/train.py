@@ -153,6 +153,7 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
     settle_threads(config.threads)
     split = split_tasks(dataset, config.validate)
     path = config.out or default_folder(config)
+    config = with_precision(config, path)
     data = OfflineData(
         dataset,
         split.train,
@@ -177,6 +178,17 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
         return _evaluate(config, learner, folder, split, best_behavior(dataset))
     finally:
         folder.close()
+
+
+def with_precision(config: RunConfig, path: Path) -> RunConfig:
+    """A config with a precision in place of "auto": that of the run in its folder, or the best."""
+    from ctmrl import runs
+    from datagen.accelerator import best_precision
+
+    if config.precision != "auto":
+        return config
+    begun = None if config.restart else runs.begun_with(path, "precision")
+    return dataclasses.replace(config, precision=begun or best_precision())
 
 
 def _way_on(folder: RunFolder) -> str:

@@ -165,7 +165,7 @@ def with_engine(budget: Budget, config: CollectConfig) -> Budget:
     elif config.device.startswith("cuda"):
         fleet = replace(fleet, size=len(task_set(config.env)))
     # Loads torch, which --help and mistakes need not wait for.
-    from datagen.fleet.networks import check_precision
+    from datagen.accelerator import check_precision
 
     precision = check_precision(config.precision, config.device)
     # Of a device such as cuda:1, what decides the bytes.

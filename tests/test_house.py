@@ -27,8 +27,9 @@ MAY_IMPORT: dict[str, set[str]] = {
         "safetensors", "stable_baselines3", "torch", *COMMAND_LINE,
     },
     "ctmrl": {
-        "ctmrl", "datagen.dataset", "meta_envs", "matplotlib", "numpy", "PIL", "safetensors",
-        "scipy", "sklearn", "tensorboard", "torch", "trackio", "wandb", *COMMAND_LINE,
+        "ctmrl", "datagen.accelerator", "datagen.dataset", "meta_envs", "matplotlib", "numpy",
+        "PIL", "safetensors", "scipy", "sklearn", "tensorboard", "torch", "trackio", "wandb",
+        *COMMAND_LINE,
     },
 }  # fmt: skip
 """What a module may import beside the standard library; its longest matching prefix counts."""
@@ -305,6 +306,8 @@ def test_a_rule_is_content_with_what_it_allows(rule: Rule, tmp_path: Path) -> No
         tests__datagen__test_columns="a = 1\n" * 400,
         tests__datagen__test_collect="",
         ctmrl__a="import torch.nn\nfrom datagen.dataset import x\nclass A:\n    size: int = 1",
+        ctmrl__c="from datagen.accelerator import x",
+        datagen__accelerator="import torch",
         ctmrl__b="class B:\n    def f(self):\n        'Docstring.'\n        raise KeyError",
     )
     assert rule(root) == []

@@ -27,8 +27,10 @@ STEPS = 12
 """Steps of a run here: with the schedule below K-means runs before steps 4 and 8."""
 
 
-def config_of(method: str = "ctmrl", brac: bool = False, **training: Any) -> RunConfig:
-    config = preset("point_robot_wind", method, "smoke")
+def config_of(
+    method: str = "ctmrl", brac: bool = False, precision: str = "float32", **training: Any
+) -> RunConfig:
+    config = preset("point_robot_wind", method, "smoke", precision=precision)
     if hasattr(config.context, "refresh"):
         schedule: dict[str, Any] = {"warm_up": 1 / 3, "refresh": 1 / 3}
         config = dataclasses.replace(
@@ -41,7 +43,10 @@ def config_of(method: str = "ctmrl", brac: bool = False, **training: Any) -> Run
     )
 
 
-@pytest.fixture(params=[("ctmrl", False), *((method, True) for method in METHODS)], ids=str)
+CONFIGS = [("ctmrl", False), *((method, True) for method in METHODS)]
+
+
+@pytest.fixture(params=[*CONFIGS, ("ctmrl", True, "bfloat16")], ids=str)
 def config(request: pytest.FixtureRequest) -> RunConfig:
     return config_of(*request.param)
 

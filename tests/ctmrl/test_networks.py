@@ -182,7 +182,8 @@ def test_a_critic_gives_the_same_in_blocks_of_rows(
     for block in (11, 4):
         monkeypatch.setattr(networks, "BLOCK", block)
         given = action.clone().requires_grad_()
-        values = critic(obs, given, frozen=frozen)
+        layers = networks.frozen(critic.layers()) if frozen else None
+        values = critic(obs, given, layers=layers)
         values.square().sum().backward()
         gradients = [parameter.grad for parameter in critic.parameters()]
         assert all((gradient is None) is frozen for gradient in gradients)

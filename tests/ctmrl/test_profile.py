@@ -137,6 +137,7 @@ def test_the_command_prints_the_table_and_writes_a_trace(
     output = commands.output()
     assert "whole step" in output
     assert "point_robot_wind, ctmrl, smoke: " in output
+    assert "GFLOP/s in float32, 1 thread." in output
     assert "There is no" not in output
     events = json.loads(trace.read_text())["traceEvents"]
     names = {event["name"] for event in events}
@@ -147,11 +148,13 @@ def test_without_a_dataset_it_says_so(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(module, "PEAK_SIZE", 64)
     console = Console(width=80, record=True, file=io.StringIO())
-    profile(ProfileConfig(env="point-robot", method="focal", preset="smoke", steps=2), console)
+    options = ProfileConfig(env="point-robot", method="focal", preset="smoke", steps=2)
+    profile(dataclasses.replace(options, precision="bfloat16"), console)
     text = console.export_text()
     assert "There is no datasets/point_robot, so these are random numbers" in text
     assert "python -m datagen.collect --env point_robot" in text
     assert "point_robot, focal, smoke: " in text
+    assert "GFLOP/s in bfloat16, 1 thread." in text
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,11 @@ import torch
 from stable_baselines3 import SAC
 
 from datagen import check
+from datagen.accelerator import best_precision
 from datagen.budgets import FleetSettings
 from datagen.card import remake_commands
 from datagen.collect import CollectConfig, main, plan_of
 from datagen.dataset import open_dataset
-from datagen.fleet.networks import best_precision
 from datagen.fleet.state import save_state
 from datagen.job import group_file
 from datagen.plan import Plan
@@ -137,7 +137,7 @@ def test_the_default_engines() -> None:
 
 @pytest.mark.parametrize("device", ["cuda", "cuda:1"])
 def test_a_gpu_has_all_tasks_at_once(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("datagen.fleet.networks.check_precision", lambda *about: "float32")
+    monkeypatch.setattr("datagen.accelerator.check_precision", lambda *about: "float32")
     many = CollectConfig("half-cheetah-vel", "smoke", device=device, workers=3)
     assert plan_of(many).groups == (tuple(range(100)),)
     # The budget of a few tasks is that of all, so that the others can be added.
@@ -215,7 +215,7 @@ def test_another_device_is_another_collection(
     hoppers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     folder = shutil.copytree(hoppers, tmp_path / "data")
-    monkeypatch.setattr("datagen.fleet.networks.check_precision", lambda *_: best_precision())
+    monkeypatch.setattr("datagen.accelerator.check_precision", lambda *_: best_precision())
     assert main([*HOPPERS, "--device", "cuda:1", "--out", str(folder)]) == 2
     said = capsys.readouterr().err
     assert "was collected with config.fleet.device 'cpu', not 'cuda'; give the same options" in said
