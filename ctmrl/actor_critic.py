@@ -47,6 +47,12 @@ class ActorCriticConfig:
     """What keeps the dual critic smooth: its value (the field's code) or its gradient (BRAC)."""
     dual_lr: float = 1e-4
     """Learning rate of the dual critic."""
+    behavior_cloning: float = 0.0
+    """Weight of minus the log likelihood of the data's actions in the policy's loss, in units of
+    the spread of Q: what TD3+BC is for a deterministic policy. 0 is without it."""
+    value_from_data: bool = False
+    """Let critics and value network begin at the value that the data's mean reward comes to, and
+    not at 0, from where they take thousands of steps."""
 
 
 class ActorCritic(nn.Module):
@@ -60,9 +66,22 @@ class ActorCritic(nn.Module):
     """
 
     def __init__(
-        self, config: ActorCriticConfig, statistics: Statistics, act_dim: int, z_dim: int
+        self,
+        config: ActorCriticConfig,
+        statistics: Statistics,
+        act_dim: int,
+        z_dim: int,
+        first_value: float = 0.0,
     ) -> None:
-        """Build the networks; initial weights come from torch's global generator."""
+        """Build the networks; initial weights come from torch's global generator.
+
+        Args:
+            config: hyper-parameters.
+            statistics: of the training data.
+            act_dim: A.
+            z_dim: Z.
+            first_value: about what critics and value network answer at first.
+        """
         super().__init__()
         self.config = config
         self.entropy_coef = 1.0 / config.reward_scale
@@ -71,6 +90,8 @@ class ActorCritic(nn.Module):
         self.critic = Critic(obs, act_dim + z_dim, config.hidden, heads=2)
         self.value = Critic(obs, z_dim, config.hidden, heads=1)
         self.target_value = Critic(obs, z_dim, config.hidden, heads=1)
+        for network in (self.critic, self.value):
+            network.shift(first_value)
         self.target_value.load_state_dict(self.value.state_dict())
         self.target_value.requires_grad_(False)
         self.multiplier: brac.Multiplier | None = None
@@ -116,6 +137,10 @@ class ActorCritic(nn.Module):
         regularizer = sample.mean.square().mean() + sample.log_std.square().mean()
         actor = (entropy_cost - q).mean()
         actor = actor + self.entropy_coef * self.config.regularizer * regularizer
+        cloning = self.config.behavior_cloning
+        if cloning:
+            unlikely = -sample.log_prob_of(batch.action).mean()
+            actor = actor + cloning * q.detach().std() * unlikely
         metrics = {
             "policy/q": q.detach().mean(),
             "policy/q_largest": torch.maximum(at_data.abs().amax(), q.abs().amax()).detach(),
@@ -124,6 +149,8 @@ class ActorCritic(nn.Module):
             "loss/actor": actor.detach(),
             "policy/entropy": -sample.log_prob.detach().mean(),
         }
+        if cloning:
+            metrics["loss/behavior_cloning"] = unlikely.detach()
         if self.multiplier is not None:
             metrics["loss/dual_critic"] = self._update_dual(
                 batch, z, sample.action.detach(), generator

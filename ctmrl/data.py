@@ -118,7 +118,11 @@ class OfflineData:
         self._statistics = {seen: self._measure(seen) for seen in (False, True)}
         self._fill(dataset, rows_of)
         # Now, because after this to read all rows in their order is slow.
-        self.largest_reward = float(self.unpack(self.table).reward.abs().max())
+        learned = self.unpack(self.table)
+        self.largest_reward = float(learned.reward.abs().max())
+        self._mean_reward, self._end_rate = map(
+            float, (learned.reward.mean(), learned.terminal.mean())
+        )
         self._table.filled()
 
     def _fill(self, dataset: Dataset, rows_of: Callable[[TaskData], NDArray[np.float32]]) -> None:
@@ -150,6 +154,10 @@ class OfflineData:
     def episodes(self) -> int:
         """Number of episodes of the task that has fewest."""
         return int(self._task_episodes.min())
+
+    def mean_value(self, gamma: float) -> float:
+        """Discounted sum of rewards that are the data's mean, and end as often as the data do."""
+        return self._mean_reward / max(1 - gamma * (1 - self._end_rate), 1e-6)
 
     @property
     def in_file(self) -> bool:

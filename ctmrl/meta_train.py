@@ -46,11 +46,13 @@ class Learner:
         self.precision = check_precision(config.precision, "cpu")
         statistics = data.statistics(config.context.next_obs_in_context)
         dims = Dimensions(data.obs_dim, data.act_dim, len(data), config.training.steps)
+        policy = config.actor_critic
         with torch.random.fork_rng():
             torch.manual_seed(config.seed)
             self.method = build_method(config, statistics, dims)
+            start = data.mean_value(policy.gamma) if policy.value_from_data else 0.0
             self.actor_critic = ActorCritic(
-                config.actor_critic, statistics, data.act_dim, self.method.encoder.z_dim
+                policy, statistics, data.act_dim, self.method.encoder.z_dim, start
             )
         data.check_episodes(self.method.context_sets, config.training.context_episodes)
         self.generator = torch.Generator().manual_seed(config.seed)

@@ -16,6 +16,9 @@ from ctmrl.precision import lowered
 LOG_STD_RANGE = (-20.0, 0.0)
 """Bounds of the policy's log standard deviation, as in the field's code since FOCAL."""
 
+LARGEST_ACTION = 0.9999
+"""Of the data's, where their density is asked for: before the tanh, 1 is infinitely far out."""
+
 BLOCK = 1024
 """Rows a critic evaluates at once, and differentiates at once: what they need stays in the
 processor's second cache, which makes 4096 rows a tenth faster to a fifth."""
@@ -165,6 +168,18 @@ class ActionSample(NamedTuple):
     mean: Tensor
     log_std: Tensor
 
+    def log_prob_of(self, action: Tensor) -> Tensor:
+        """Log density, [*], that the policy gives to other actions [*, A] for the same inputs."""
+        inside = action.clamp(-LARGEST_ACTION, LARGEST_ACTION)
+        noise = (torch.atanh(inside) - self.mean) / self.log_std.exp()
+        return _log_prob(noise, self.log_std, inside)
+
+
+def _log_prob(noise: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """Log density, [*], of actions [*, A] that are the tanh of mean + std * noise."""
+    gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+    return (gaussian - torch.log(1 - action.square() + 1e-6)).sum(dim=-1)
+
 
 class Actor(nn.Module):
     """Tanh-Gaussian policy pi(a | s, z)."""
@@ -193,9 +208,7 @@ class Actor(nn.Module):
         noise = torch.randn(mean.shape, generator=generator)
         pre_tanh = mean + log_std.exp() * noise
         action = torch.tanh(pre_tanh)
-        gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-        log_prob = (gaussian - torch.log(1 - action.square() + 1e-6)).sum(dim=-1)
-        return ActionSample(action, log_prob, mean, log_std)
+        return ActionSample(action, _log_prob(noise, log_std, action), mean, log_std)
 
     @torch.no_grad()
     def act(self, obs: Tensor, z: Tensor) -> Tensor:
@@ -232,6 +245,11 @@ class Critic(nn.Module):
             layers = [nn.Linear(fan_in, fan_out) for _ in range(heads)]
             self.weights.append(torch.stack([layer.weight.detach().T for layer in layers]))
             self.biases.append(torch.stack([layer.bias.detach()[None] for layer in layers]))
+
+    @torch.no_grad()
+    def shift(self, value: float) -> None:
+        """Add a number to all values."""
+        self.biases[-1].add_(value)
 
     def layers(self) -> Layers:
         """The parameters as the matrix products take them."""

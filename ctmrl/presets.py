@@ -11,7 +11,7 @@ from ctmrl.config import MetaTrainConfig, Preset, RunConfig
 from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
-from ctmrl.runs import LATER_SETTINGS
+from ctmrl.runs import with_later_settings
 
 Settings = dict[str, Any]
 """Options by name, where they are not the defaults of their dataclasses."""
@@ -209,7 +209,7 @@ def config_from_settings(stored: dict[str, Any], path: Path) -> RunConfig:
         UsageError: the file does not fit this version of the package.
     """
     try:
-        settings = LATER_SETTINGS | stored["settings"]
+        settings = with_later_settings(stored["settings"])
         base = preset(settings["env"], settings["method"], settings["preset"])
         restored: RunConfig = _restored(base, settings)
         return restored

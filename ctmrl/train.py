@@ -71,15 +71,11 @@ def settings_of(
     config: RunConfig, dataset: Dataset, split: Split, learner: Learner
 ) -> dict[str, Any]:
     """What config.json holds: all that decides the run's results."""
-    from ctmrl.runs import LATER_SETTINGS
+    from ctmrl.runs import without_later_settings
 
+    every = dataclasses.asdict(config).items()
     return {
-        "settings": {
-            key: value
-            for key, value in dataclasses.asdict(config).items()
-            if key not in NOT_SETTINGS
-            and not (key in LATER_SETTINGS and value == LATER_SETTINGS[key])
-        },
+        "settings": without_later_settings({k: v for k, v in every if k not in NOT_SETTINGS}),
         "dataset": dataset.hash,
         "groups": {"unseen": split.unseen.tolist(), "seen": split.train.tolist()},
         "best_behavior": {str(task): value for task, value in best_behavior(dataset).items()},

@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.distributions import Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
 
 from ctmrl.actor_critic import ActorCritic, ActorCriticConfig
 from ctmrl.data import Transitions
@@ -127,6 +129,40 @@ def test_the_actors_and_the_value_networks_losses_are_the_fields_divided_by_r(br
     assert metrics["loss/actor"].item() * R == pytest.approx(actor_loss.item(), rel=1e-6)
     entropy = -sample.log_prob.mean().item()
     assert metrics["policy/entropy"].item() == pytest.approx(entropy, rel=1e-6)
+
+
+def test_behaviour_cloning_is_of_the_data_in_units_of_the_spread_of_q() -> None:
+    plain, cloning = actor_critic(), actor_critic(behavior_cloning=0.7)
+    cloning.load_state_dict(plain.state_dict())
+    rows, z = double_batch(), contexts()
+    old = copy.deepcopy(cloning)
+    after_a_backward_pass(plain, rows, z)
+    metrics = after_a_backward_pass(cloning, rows, z)
+    mean, log_std = old.actor(rows.obs, z)
+    policy = TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform())
+    unlikely = -policy.log_prob(rows.action).sum(dim=1).mean()  # type: ignore[no-untyped-call]
+    sampled = old.actor.sample(rows.obs, z, generator(1)).action
+    spread = old.critic(rows.obs, sampled, z).amin(dim=0).std().item()
+    assert spread > 0.01
+    assert metrics["loss/behavior_cloning"].item() == pytest.approx(unlikely.item(), rel=1e-4)
+    both = zip(gradients(cloning.actor), gradients(plain.actor), strict=True)
+    added = of(0.7 * spread * unlikely, old.actor)
+    for (found, without), wanted in zip(both, added, strict=True):
+        torch.testing.assert_close(found - without, wanted, rtol=1e-4, atol=1e-6)
+    for network in ("critic", "value"):
+        assert_same(gradients(getattr(cloning, network)), gradients(getattr(plain, network)))
+
+
+def test_critics_and_value_networks_begin_at_a_value() -> None:
+    made = []
+    for value in (0.0, -53.0):
+        torch.manual_seed(0)
+        made.append(ActorCritic(ActorCriticConfig(hidden=(23,)), statistics(), ACT, Z, value))
+    rows, z = batch(ROWS), contexts().float()
+    for name, inputs in (("critic", (rows.action, z)), ("value", (z,)), ("target_value", (z,))):
+        plain, moved = (getattr(ac, name)(rows.obs, *inputs) for ac in made)
+        torch.testing.assert_close(moved, plain - 53.0)
+    assert_same([*made[0].actor.parameters()], [*made[1].actor.parameters()])
 
 
 @pytest.mark.parametrize("penalty", ["value", "gradient"])

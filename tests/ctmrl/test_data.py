@@ -133,6 +133,15 @@ def test_episodes_are_chosen_uniformly(data: OfflineData) -> None:
     assert (counts - 100).abs().max() < 45
 
 
+def test_the_mean_value_is_that_of_a_walk_that_ends_as_often_as_the_data(data: OfflineData) -> None:
+    rows = data.unpack(data.table)
+    reward, end = rows.reward.double().mean().item(), rows.terminal.double().mean().item()
+    assert 0 < end < 1
+    alive = (1 - end) ** np.arange(2_000)
+    wanted = reward * (0.97 ** np.arange(2_000) * alive).sum()
+    assert data.mean_value(0.97) == pytest.approx(wanted, rel=1e-4)
+
+
 def test_draws_depend_on_the_generator_alone(data: OfflineData) -> None:
     tasks = torch.tensor([1, 0])
     first, again, other = (data.contexts(tasks, 2, 2, 7, generator(seed)) for seed in (3, 3, 4))

@@ -106,6 +106,11 @@ def test_the_log_probability_is_that_of_a_tanh_gaussian() -> None:
     torch.testing.assert_close(sample.log_prob, log_prob, rtol=1e-4, atol=1e-3)
     assert sample.mean.equal(mean)
     assert sample.log_std.equal(log_std)
+    other = torch.tanh(normal(BATCH, ACT, seed=2))
+    log_prob = wanted.log_prob(other)  # type: ignore[no-untyped-call] # torch's
+    torch.testing.assert_close(sample.log_prob_of(other), log_prob, rtol=1e-4, atol=1e-3)
+    edge = torch.full((BATCH, ACT), -1.0, dtype=torch.float64)
+    assert sample.log_prob_of(edge).isfinite().all()
 
 
 def test_actions_are_reparameterised_with_the_generators_noise() -> None:
