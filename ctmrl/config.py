@@ -16,6 +16,7 @@ from datagen.dataset import Quality
 
 Preset = Literal["standard", "paper", "smoke"]
 Precision = Literal["auto", "float32", "bfloat16"]
+Beside = Literal["auto", "always", "never"]
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,10 @@ class RunConfig:
     """GB of memory the training data may take as a table; default half of what is available. A
     larger table is read from a file beside the run, which ends with the process and changes no
     result; 0 always does that."""
+    beside: Beside = "auto"
+    """Measure the returns on training tasks while training goes on: auto where the process has a
+    core that neither --threads nor other --seeds take. Changes no result; rows and checkpoints are
+    written when their return is known."""
     loggers: tuple[str, ...] = ()
     """Where metrics go beside metrics.csv: any of tensorboard, trackio and wandb, each an extra
     (pip install 'ctmrl[wandb]'). docs/metrics.md lists the metrics."""

@@ -71,13 +71,18 @@ def check_seeds(seed: int | None, seeds: tuple[int, ...] | None, workers: int | 
 
 
 def plan(config: RunConfig, folder: Path) -> tuple[list[RunConfig], int]:
-    """The run of each of the config's seeds, in a folder below `folder`; how many at a time."""
+    """The run of each of the config's seeds, in a folder below `folder`; how many at a time.
+
+    Each run's `workers` is that number, for the cores that it leaves to the others.
+    """
     workers = min(config.workers or max(cores() // config.threads, 1), len(config.seeds))
     memory = config.memory
     if memory is None:
         memory = SHARE * available_memory() / 1e9 / workers
     runs = [
-        dataclasses.replace(config, seed=seed, out=folder / f"seed-{seed}", memory=memory)
+        dataclasses.replace(
+            config, seed=seed, out=folder / f"seed-{seed}", memory=memory, workers=workers
+        )
         for seed in config.seeds
     ]
     return runs, workers

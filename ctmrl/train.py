@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
     from rich.console import Console
+    from torch import Tensor
 
     from ctmrl.config import RunConfig
     from ctmrl.meta_train import Learner
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 LOGS, CHECKPOINTS, RETURNS = 100, 50, 10
 """Rows of metrics, checkpoints, and measured returns on training tasks in a run."""
-NOT_SETTINGS = {"data", "out", "restart", "loggers", "memory", "seeds", "workers"}
+NOT_SETTINGS = {"data", "out", "restart", "loggers", "memory", "seeds", "workers", "beside"}
 """Fields of RunConfig that do not change a run's results."""
 PACKAGES = ("ctmrl", "numpy", "torch", "gymnasium", "scikit-learn")
 
@@ -220,6 +221,7 @@ def _meta_train(
     from ctmrl.console import TrainingDisplay
     from ctmrl.loggers import open_loggers
     from ctmrl.meta_train import meta_train
+    from ctmrl.returns import Rows, measure_of, measured_beside
 
     state = folder.checkpoint()
     if state is not None:
@@ -238,35 +240,25 @@ def _meta_train(
         TrainingDisplay(console, steps, learner.step, n_codes) as display,
     ):
 
-        def save() -> None:
-            folder.save_checkpoint(learner.state())
-            loggers.pass_on()
-
-        for metrics in meta_train(learner, log_every, save, save_every):
-            measure = learner.step % measure_every == 0 or learner.step == steps
-            value = _training_return(config, learner) if measure else None
-            row: dict[str, float | None] = {**metrics, "return/training_tasks": value}
+        def write(row: dict[str, float | None]) -> None:
             folder.append_metrics(row)
-            loggers.log(learner.step, row)
+            loggers.log(int(row["step"] or 0), row)
             display.show(row)
             if watch:
                 watch(row)
 
+        def save(state: dict[str, Tensor]) -> None:
+            folder.save_checkpoint(state)
+            loggers.pass_on()
 
-def _training_return(config: RunConfig, learner: Learner) -> float:
-    from ctmrl.meta_test import meta_test
-    from meta_envs import task_set
+        with Rows(write, save, measured_beside(config), config.threads) as rows:
 
-    once = dataclasses.replace(config.meta_test, repetitions=1)
-    result = meta_test(
-        learner.method.encoder,
-        learner.actor_critic.actor,
-        task_set(config.env),
-        learner.data.tasks,
-        once,
-        config.seed,
-    )
-    return float(result.returns.mean())
+            def pass_state() -> None:
+                rows.save(learner.state())
+
+            for metrics in meta_train(learner, log_every, pass_state, save_every):
+                measure = learner.step % measure_every == 0 or learner.step == steps
+                rows.add(metrics, measure_of(config, learner) if measure else None)
 
 
 def _evaluate(

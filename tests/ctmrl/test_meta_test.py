@@ -295,7 +295,8 @@ def test_a_group_beside_others_is_what_it_is_alone(
         request.getfixturevalue("noisy_robot")
     test = MetaTest(*networks(env), task_set(env), PROTOCOL, SEED)
     groups = {"few": ROWS, "one": np.array([3]), "many": np.array([9, 4, 1, 2, 8, 0, 7])}
-    alone, lengths = {}, {}
+    alone: dict[str, MetaTestResult] = {}
+    lengths: dict[str, int] = {}
     for name, rows in groups.items():
         found, lengths[name] = counted(test, {name: rows})
         alone |= found

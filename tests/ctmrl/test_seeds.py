@@ -201,7 +201,7 @@ def test_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         (seed, tmp_path / f"seed-{seed}") for seed in config.seeds
     ]
     # Cores are shared by threads and seeds, and what is left of memory by those at work.
-    assert (workers, {run.memory for run in runs}) == (2, {2.0})
+    assert (workers, {(run.memory, run.workers) for run in runs}) == (2, {(2.0, 2)})
     single = dataclasses.replace(config, threads=1, memory=1.5)
     runs, workers = plan(single, tmp_path)
     assert (workers, {run.memory for run in runs}) == (3, {1.5})
