@@ -73,10 +73,12 @@ def settings_of(
     """What config.json holds: all that decides the run's results."""
     from ctmrl.runs import LATER_SETTINGS
 
+    # Of a device such as cuda:1, what decides the bytes.
+    kind = learner.device.type
     return {
         "settings": {
             key: value
-            for key, value in dataclasses.asdict(config).items()
+            for key, value in {**dataclasses.asdict(config), "device": kind}.items()
             if key not in NOT_SETTINGS
             and not (key in LATER_SETTINGS and value == LATER_SETTINGS[key])
         },
@@ -96,9 +98,11 @@ def check(config: RunConfig) -> Dataset:
     """
     from ctmrl.config import check_settings
     from ctmrl.loggers import check_loggers
+    from ctmrl.meta_train import usable_precision
 
     check_settings(config)
     check_loggers(config.loggers)
+    usable_precision(config)
     return open_data(config)
 
 
@@ -188,7 +192,7 @@ def with_precision(config: RunConfig, path: Path) -> RunConfig:
     if config.precision != "auto":
         return config
     begun = None if config.restart else runs.begun_with(path, "precision")
-    return dataclasses.replace(config, precision=begun or best_precision())
+    return dataclasses.replace(config, precision=begun or best_precision(config.device))
 
 
 def _way_on(folder: RunFolder) -> str:
@@ -262,9 +266,10 @@ def _training_return(config: RunConfig, learner: Learner) -> float:
     from meta_envs import task_set
 
     once = dataclasses.replace(config.meta_test, repetitions=1)
+    agent = learner.agent
     result = meta_test(
-        learner.method.encoder,
-        learner.actor_critic.actor,
+        agent.method.encoder,
+        agent.actor,
         task_set(config.env),
         learner.data.tasks,
         once,
