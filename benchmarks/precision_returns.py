@@ -94,7 +94,7 @@ def main() -> int:
                 results.append(result(env, precision, seed, options))
                 if options.out is not None:
                     write_results(options.out, results, {"torch": torch.__version__})
-    Console().print(table_of(results))
+    Console(width=100).print(table_of(results))
     return 0
 
 

@@ -5,7 +5,9 @@ Contexts come in detached: no gradient of anything here reaches an encoder.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +15,7 @@ from torch import Tensor, nn
 from ctmrl import brac
 from ctmrl.data import Transitions
 from ctmrl.networks import Actor, Critic, Statistics, frozen
+from ctmrl.numbers import Source, uniform
 
 
 @dataclass(frozen=True)
@@ -108,13 +111,20 @@ class ActorCritic(nn.Module):
                 config.divergence_wind_up,
             )
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call] # torch's own
+        if self.multiplier is not None:
+            # Its precision is its own.
+            self.multiplier.value = fn(self.multiplier.value).float()
+        return self
+
     def main_parameters(self) -> list[nn.Parameter]:
         """What the sum of the losses trains: actor, critics and value network."""
         modules = (self.actor, self.critic, self.value)
         return [parameter for module in modules for parameter in module.parameters()]
 
     def loss(
-        self, batch: Transitions, z: Tensor, generator: torch.Generator
+        self, batch: Transitions, z: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Losses of critics, value network and actor; with BRAC, also updates the dual critic.
 
@@ -187,9 +197,9 @@ class ActorCritic(nn.Module):
         return brac.dual_divergence(at_policy, at_data)
 
     def _update_dual(
-        self, batch: Transitions, z: Tensor, action: Tensor, generator: torch.Generator
+        self, batch: Transitions, z: Tensor, action: Tensor, generator: Source
     ) -> Tensor:
-        share = torch.rand(len(action), 1, generator=generator)
+        share = uniform(generator, len(action), 1)
         between_action = action + share * (batch.action - action)
         use_gradient = self.config.dual_penalty == "gradient"
         between_action.requires_grad_(use_gradient)

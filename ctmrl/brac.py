@@ -52,7 +52,7 @@ class Multiplier:
     """Lagrange multiplier of the divergence: it grows while the divergence is above its target.
 
     Attributes:
-        value: lambda, a scalar tensor.
+        value: lambda, a scalar tensor that is changed in place.
     """
 
     def __init__(self, initial: float, maximum: float, target: float, wind_up: bool) -> None:
@@ -74,6 +74,5 @@ class Multiplier:
 
     def update(self, divergence: Tensor) -> None:
         """One step of gradient ascent with learning rate 1."""
-        self.value = self.value + divergence.detach().mean() - self.target
-        if not self.wind_up:
-            self.value = self.value.clamp(0.0, self.maximum)
+        value = self.value + divergence.detach().mean() - self.target
+        self.value.copy_(value if self.wind_up else value.clamp(0.0, self.maximum))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ctmrl.cqvae import cosine, match, moving_update
+from ctmrl.cqvae import cosine, count, match, moving_update
 from ctmrl.errors import UsageError
 
 
@@ -41,30 +43,49 @@ def kmeans(contexts: Tensor, n_codes: int, seed: int) -> Tensor:
     from sklearn.cluster import KMeans
     from sklearn.exceptions import ConvergenceWarning
 
-    directions = functional.normalize(contexts, dim=1, eps=1e-6).numpy().astype(np.float64)
+    directions = functional.normalize(contexts, dim=1, eps=1e-6).cpu().numpy().astype(np.float64)
     with warnings.catch_warnings():
         # Fewer distinct contexts than codes: the surplus centres repeat others, which is right.
         warnings.simplefilter("ignore", ConvergenceWarning)
         labels = KMeans(n_codes, n_init=4, random_state=seed).fit_predict(directions)
-    found = torch.from_numpy(labels).long()
-    counts = torch.bincount(found, minlength=n_codes)
-    sums = torch.zeros(n_codes, contexts.shape[1]).index_add_(0, found, contexts)
+    found = torch.from_numpy(labels).long().to(contexts.device)
+    counts = count(found, n_codes)
+    sums = contexts.new_zeros(n_codes, contexts.shape[1]).index_add_(0, found, contexts)
     means = sums / counts.clamp_min(1)[:, None]
     fallback = contexts[torch.arange(n_codes) % len(contexts)]
     return torch.where(counts[:, None] > 0, means, fallback)
 
 
-class Codebook(nn.Module):
-    """N codes of size Z, a parameter that Equation (2) moves and the losses' gradients refine."""
+class Placed(nn.Module):
+    """What codebooks have in common.
+
+    Attributes:
+        placed: bool scalar, whether the codes are in use; on the host whatever device the codes are
+            on, because it decides what a step does.
+    """
 
     placed: Tensor
+
+    def __init__(self) -> None:
+        """They are not in use."""
+        super().__init__()
+        self.register_buffer("placed", torch.zeros((), dtype=torch.bool))
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        placed = self.placed
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call] # torch's own
+        self.placed = placed
+        return self
+
+
+class Codebook(Placed):
+    """N codes of size Z, a parameter that Equation (2) moves and the losses' gradients refine."""
 
     def __init__(self, n_codes: int, z_dim: int, generator: torch.Generator) -> None:
         """Start from random unit vectors; K-means places them later, unless it is switched off."""
         super().__init__()
         start = functional.normalize(torch.randn(n_codes, z_dim, generator=generator), dim=1)
         self.codes = nn.Parameter(start)
-        self.register_buffer("placed", torch.zeros((), dtype=torch.bool))
 
     def match(self, contexts: Tensor) -> Tensor:
         """Equation (1): index of each context's code, int64 [B]."""
@@ -90,7 +111,7 @@ class Codebook(nn.Module):
         """
         centres = kmeans(contexts, len(self.codes), seed)
         self.update(centres, self.match(centres), eta)
-        used = torch.bincount(self.match(contexts), minlength=len(self.codes)) > 0
+        used = count(self.match(contexts), len(self.codes)) > 0
         dead = torch.nonzero(~used)[:, 0]
         if len(dead):
             nearest = cosine(centres, self.codes[used]).max(dim=1).values
@@ -104,13 +125,13 @@ SHARE = "codes/share/"
 
 def usage(matched: Tensor, n_codes: int) -> dict[str, Tensor]:
     """Metrics of how the tasks of a batch use the codes: perplexity, and the share of each code."""
-    shares = torch.bincount(matched, minlength=n_codes) / len(matched)
+    shares = count(matched, n_codes) / len(matched)
     named = {f"{SHARE}{index}": share for index, share in enumerate(shares.unbind())}
     return {"codes/perplexity": perplexity(matched, n_codes), **named}
 
 
 def perplexity(matched: Tensor, n_codes: int) -> Tensor:
     """How many codes are in use, exp of the entropy of the assignment; 1 to N."""
-    share = torch.bincount(matched, minlength=n_codes) / len(matched)
+    share = count(matched, n_codes) / len(matched)
     found: Tensor = torch.special.entr(share).sum().exp()
     return found

@@ -85,6 +85,10 @@ class RunConfig:
     """Of the networks' matrix products in meta-training; all else, and every measured return, is
     float32. auto is bfloat16 where the hardware has units for it (AMX, most GPUs) and float32
     elsewhere; a run goes on in the precision it began with. The MuJoCo robots' default is auto."""
+    device: str = "cpu"
+    """Where meta-training computes: cpu, cuda, or cuda:1 for the second GPU. On a GPU a gradient
+    step is one CUDA graph, which --seeds share it with. Evaluation is on the processor. A run goes
+    on on the kind of device it began on."""
     memory: float | None = None
     """GB of memory the training data may take as a table; default half of what is available. A
     larger table is read from a file beside the run, which ends with the process and changes no

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ctmrl.numbers import Source, uniform
+
 EPSILON = 1e-6
 """Least norm a vector is divided by, so that a zero vector has cosine 0 and not NaN."""
 
@@ -26,6 +28,11 @@ def match(contexts: Tensor, codes: Tensor) -> Tensor:
     return cosine(contexts, codes).argmax(dim=1)
 
 
+def count(matched: Tensor, n_codes: int) -> Tensor:
+    """How many of some codes, int64 [B], are each of the N: int64 [N]."""
+    return (matched[:, None] == torch.arange(n_codes, device=matched.device)).sum(dim=0)
+
+
 def moving_update(codes: Tensor, contexts: Tensor, matched: Tensor, eta: float) -> Tensor:
     """Equation (2): C_new = (1 - eta) C_old + eta c, for matched codes only.
 
@@ -40,9 +47,9 @@ def moving_update(codes: Tensor, contexts: Tensor, matched: Tensor, eta: float) 
     Returns:
         Updated codes [N, Z]; unmatched ones are unchanged.
     """
-    counts = torch.zeros(len(codes)).index_add_(0, matched, torch.ones(len(matched)))
+    counts = count(matched, len(codes))
     sums = torch.zeros_like(codes).index_add_(0, matched, contexts)
-    means = sums / counts.clamp_min(1.0)[:, None]
+    means = sums / counts.clamp_min(1)[:, None]
     return torch.where(counts[:, None] > 0, (1 - eta) * codes + eta * means, codes)
 
 
@@ -106,14 +113,13 @@ def hard_contrast_loss(
         Scalar, (1/N) sum over codes of the mean over the code's tasks.
     """
     logits = cosine(anchors, positives) / tau
-    own = torch.eye(len(anchors), dtype=torch.bool)
+    own = torch.eye(len(anchors), dtype=torch.bool, device=anchors.device)
     masked = logits.masked_fill(~(negatives | own), -torch.inf)
     per_task = masked.logsumexp(dim=1) - logits.diagonal()
-    group_size = torch.zeros(n_codes).index_add_(0, groups, torch.ones(len(groups)))
-    return (per_task / group_size[groups]).sum() / n_codes
+    return (per_task / count(groups, n_codes)[groups]).sum() / n_codes
 
 
-def hard_negatives(groups: Tensor, extra: int, generator: torch.Generator) -> Tensor:
+def hard_negatives(groups: Tensor, extra: int, generator: Source) -> Tensor:
     """Which tasks are negatives of which: those of the same code, or M random ones for singletons.
 
     Args:
@@ -126,11 +132,11 @@ def hard_negatives(groups: Tensor, extra: int, generator: torch.Generator) -> Te
         bool [B, B], False on the diagonal.
     """
     n = len(groups)
-    own = torch.eye(n, dtype=torch.bool)
+    own = torch.eye(n, dtype=torch.bool, device=groups.device)
     same = (groups[:, None] == groups[None, :]) & ~own
-    keys = torch.rand(n, n, generator=generator).masked_fill(own, 2.0)
+    keys = uniform(generator, n, n).masked_fill(own, 2.0)
     m = min(extra, n - 1)
-    drawn = torch.zeros(n, n, dtype=torch.bool)
+    drawn = torch.zeros_like(own)
     drawn.scatter_(1, keys.topk(m, dim=1, largest=False).indices, True)
     alone = ~same.any(dim=1)
     return torch.where(alone[:, None], drawn, same)

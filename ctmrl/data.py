@@ -70,6 +70,7 @@ class OfflineData:
         act_dim: A.
         params: float32 [T, P], the tasks' true parameters, which no method but a reference sees.
         table: [N, 2 O + A + 3].
+        device: where what is drawn lies, and the table too unless it is in a file.
         largest_reward: largest absolute reward the actor-critic learns from.
     """
 
@@ -99,6 +100,7 @@ class OfflineData:
         at = np.searchsorted(dataset.tasks, self.tasks)
         self.params = torch.tensor(dataset.params[at], dtype=torch.float32)
         lengths = [dataset.episodes(int(task)).lengths for task in tasks]
+        self.device = torch.device("cpu")
         self._task_rows = torch.tensor([int(rows.sum()) for rows in lengths])
         self._task_start = torch.cumsum(self._task_rows, 0) - self._task_rows
         self._task_episodes = torch.tensor([len(rows) for rows in lengths])
@@ -164,6 +166,28 @@ class OfflineData:
         """Whether the table is in a file instead of in memory."""
         return self._table.in_file
 
+    def to(self, device: torch.device) -> None:
+        """Have all that is drawn on a device, and there the table, if it is in memory.
+
+        Raises:
+            UsageError: the device has no room for the table.
+        """
+        if device == self.device:
+            return
+        self.device, self.params = device, self.params.to(device)
+        if not self.in_file:
+            try:
+                self.table = self._table.values = self.table.to(device)
+            except torch.OutOfMemoryError:
+                raise UsageError(
+                    f"the training data take {self.table.nbytes / 1e9:.2f} GB as a table, more "
+                    f"than {device} has: --memory 0 keeps them in a file"
+                ) from None
+
+    def _gather(self, rows: Tensor) -> Tensor:
+        """Rows of the table, numbers [n] on the host, on the device."""
+        return self.table.index_select(0, rows.to(self.table.device)).to(self.device)
+
     def page_in(self, rows: Tensor) -> None:
         """Begin to read rows of the table from its file, if it is in one; returns at once."""
         self._table.page_in(rows)
@@ -174,7 +198,7 @@ class OfflineData:
 
     def transitions(self, tasks: Tensor, n: int, generator: torch.Generator) -> Transitions:
         """Draw n transitions a task, uniformly with replacement, [B * n, ...]."""
-        return self.unpack(self.table.index_select(0, self.batch_rows(tasks, n, generator)))
+        return self.unpack(self._gather(self.batch_rows(tasks, n, generator)))
 
     def batch_rows(self, tasks: Tensor, n: int, generator: torch.Generator) -> Tensor:
         """The rows of the table that `transitions` draws."""
@@ -221,7 +245,7 @@ class OfflineData:
         """
         rows = self.context_rows(tasks, sets, episodes, n, generator)
         width = self._layout.context
-        gathered = self.table.index_select(0, rows)[:, :width]
+        gathered = self._gather(rows)[:, :width]
         return gathered.view(sets, len(tasks), n, width)
 
     def context_rows(

@@ -7,30 +7,28 @@ reaches the codes and that every code, matched or not, is made anew at every upd
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
-from ctmrl.codebook import kmeans
-from ctmrl.cqvae import match
+from ctmrl.codebook import Placed, kmeans
+from ctmrl.cqvae import count, match
 
 SMOOTHING = 1e-5
 """Laplace smoothing of the codes' sizes, which keeps the division finite for a code of size 0."""
 
 
-class EMACodebook(nn.Module):
+class EMACodebook(Placed):
     """N codes of size Z.
 
     Attributes:
         codes: [N, Z].
         sizes: [N], moving number of contexts that match a code at an update.
         sums: [N, Z], moving sum of those contexts.
-        placed: bool scalar, whether the codes are in use.
     """
 
     codes: Tensor
     sizes: Tensor
     sums: Tensor
-    placed: Tensor
 
     def __init__(self, n_codes: int, z_dim: int, generator: torch.Generator) -> None:
         """Start from random unit vectors, which are not used before K-means places the codes."""
@@ -39,7 +37,6 @@ class EMACodebook(nn.Module):
         self.register_buffer("codes", start)
         self.register_buffer("sizes", torch.zeros(n_codes))
         self.register_buffer("sums", start.clone())
-        self.register_buffer("placed", torch.zeros((), dtype=torch.bool))
 
     def match(self, contexts: Tensor) -> Tensor:
         """Index of the code nearest to each context by cosine, [B, Z] -> int64 [B].
@@ -58,7 +55,7 @@ class EMACodebook(nn.Module):
             matched: int64 [B], from `match`.
             decay: share of the old sizes and sums that stays.
         """
-        counts = torch.bincount(matched, minlength=len(self.codes))
+        counts = count(matched, len(self.codes))
         sums = torch.zeros_like(self.sums).index_add_(0, matched, contexts)
         self.sizes.mul_(decay).add_(counts, alpha=1 - decay)
         self.sums.mul_(decay).add_(sums, alpha=1 - decay)
@@ -74,7 +71,7 @@ class EMACodebook(nn.Module):
         that the codes are short at first and grow to their length within some fifty updates.
         """
         centres = _unit_centres(contexts, len(self.codes), seed)
-        counts = torch.bincount(match(contexts, centres), minlength=len(centres))
+        counts = count(match(contexts, centres), len(centres))
         self.codes.copy_(centres)
         self.sums.copy_(centres)
         # A centre that repeats another has no contexts; over a size of 0 its sum would be huge.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping
 
 import torch
@@ -12,8 +13,11 @@ from ctmrl.agent import Agent, build_method, part
 from ctmrl.codebook import SHARE
 from ctmrl.config import MetaTrainConfig, RunConfig
 from ctmrl.data import OfflineData
+from ctmrl.errors import UsageError
 from ctmrl.methods.base import Dimensions
-from ctmrl.precision import products_in
+from ctmrl.numbers import Numbers, Source
+from ctmrl.precision import Precision, products_in
+from ctmrl.recording import Given, RecordedStep
 from ctmrl.soundness import check_sound, q_limit
 from datagen.accelerator import check_precision
 
@@ -23,11 +27,24 @@ LAST_RATE = 0.01
 """Share of the learning rates left at the end of a decaying run."""
 
 
+def usable_precision(config: RunConfig) -> Precision:
+    """The precision of a run's steps on its device.
+
+    Raises:
+        UsageError: the device cannot be used.
+    """
+    try:
+        return check_precision(config.precision, config.device)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
 class Learner:
     """Method, actor-critic, optimisers and generator of one run, and one gradient step of them.
 
     Attributes:
         step: gradient steps taken.
+        device: where steps are computed; it decides nothing of what they draw.
         precision: of the networks' matrix products in a step.
         method: the context-learning method.
         actor_critic: the actor-critic.
@@ -38,12 +55,13 @@ class Learner:
         """Build everything from the run's seed.
 
         Raises:
-            UsageError: settings that do not fit the dataset, one sentence.
+            UsageError: settings that do not fit the dataset or the machine, one sentence.
         """
         self.config: MetaTrainConfig = config.training
         self.data = data
         self.step = 0
-        self.precision = check_precision(config.precision, "cpu")
+        self.precision = usable_precision(config)
+        self.device = torch.device(config.device)
         statistics = data.statistics(config.context.next_obs_in_context)
         dims = Dimensions(data.obs_dim, data.act_dim, len(data), config.training.steps)
         policy = config.actor_critic
@@ -55,6 +73,10 @@ class Learner:
                 policy, statistics, data.act_dim, self.method.encoder.z_dim, start
             )
         data.check_episodes(self.method.context_sets, config.training.context_episodes)
+        data.to(self.device)
+        self.method.to(self.device)
+        self.actor_critic.to(self.device)
+        # The host's on every device.
         self.generator = torch.Generator().manual_seed(config.seed)
         main = torch.optim.Adam(
             [
@@ -74,13 +96,31 @@ class Learner:
             for name, optimizer in self.optimizers.items()
         }
         self._every = torch.arange(len(data))
+        self._numbers = Numbers(self.generator, self.device)
+        self._recorded: RecordedStep | None = None
+        if self.device.type == "cuda":
+            self.record()
         entropy = self.actor_critic.entropy_coef * data.act_dim
         self._limits = {LARGEST_Q: q_limit(data.largest_reward, entropy, config.actor_critic.gamma)}
 
     @property
     def agent(self) -> Agent:
-        """The agent as it is now."""
-        return Agent(self.method, self.actor_critic.actor)
+        """The agent as it is now, on the host."""
+        agent = Agent(self.method, self.actor_critic.actor)
+        if self.device.type == "cpu":
+            return agent
+        return Agent(copy.deepcopy(agent.method).cpu(), copy.deepcopy(agent.actor).cpu())
+
+    def record(self) -> None:
+        """From now on take steps as recordings of a GPU."""
+        self._recorded = RecordedStep(
+            lambda given, source: self._step(given, source)[0], self.generator, self.device
+        )
+        for optimizer in self.optimizers.values():
+            for group in optimizer.param_groups:
+                group["capturable"] = True
+                # A recording reads it anew each time.
+                group["lr"] = torch.tensor(group["lr"], dtype=torch.float32, device=self.device)
 
     def all_contexts(self) -> Tensor:
         """One fresh context of every training task, [T, Z], without gradients."""
@@ -119,32 +159,57 @@ class Learner:
         Returns:
             Scalars by metric name.
         """
-        config, method = self.config, self.method
         self._set_rates()
-        method.before_step(self.step, self.all_contexts)
+        self.method.before_step(self.step, self.all_contexts)
         tasks = self._draw_tasks(self.generator)
-        contexts = self._draw(tasks, method.context_sets)
-        batch = self.data.transitions(tasks, config.batch_size, self.generator)
-        with products_in(self.precision):
-            z = method.encoder(contexts)
-            context_loss, metrics = method.context_loss(contexts, z, self.generator)
-            # The first set's contexts, detached: the actor-critic must not train the encoder.
-            given = method.encoder.told(z[0].detach(), self.data.params[tasks])
-            repeated = given.repeat_interleave(config.batch_size, dim=0)
-            policy_loss, more = self.actor_critic.loss(batch, repeated, self.generator)
+        given = Given(
+            self._draw(tasks, self.method.context_sets),
+            self.data.transitions(tasks, self.config.batch_size, self.generator),
+            self.data.params[tasks],
+        )
+        if self._recorded is None or look is not None:
+            metrics, made = self._step(given, self._numbers, self._page_in)
+            self.step += 1
+            if look is not None:
+                look(made)
+                look(self._gradients_and_parameters())
+            return metrics
+        metrics = self._recorded(given, self.method.phase)
         self._page_in()
+        self.step += 1
+        return metrics
+
+    def _step(
+        self, given: Given, source: Source, drawn: Callable[[], None] = lambda: None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """All of a step that is computed, so that a GPU can record it.
+
+        Args:
+            given: what the data give it.
+            source: of its random numbers.
+            drawn: called when it has taken all of them, before the gradients.
+
+        Returns:
+            Scalars by metric name; and all the step is made of, in the order it came about.
+        """
+        contexts, batch, params = given
+        with products_in(self.precision):
+            z = self.method.encoder(contexts)
+            context_loss, metrics = self.method.context_loss(contexts, z, source)
+            # The first set's contexts, detached: the actor-critic must not train the encoder.
+            told = self.method.encoder.told(z[0].detach(), params)
+            repeated = told.repeat_interleave(self.config.batch_size, dim=0)
+            policy_loss, more = self.actor_critic.loss(batch, repeated, source)
+        drawn()
+        loss = context_loss + policy_loss
         self.optimizers["main"].zero_grad()
-        (context_loss + policy_loss).backward()  # type: ignore[no-untyped-call]
+        loss.backward()  # type: ignore[no-untyped-call] # torch's own
         self.optimizers["main"].step()
         self.actor_critic.follow_value()
-        self.step += 1
         metrics |= _spread(z.detach()) | more
-        if look is not None:
-            data = {f"data/{name}": values for name, values in batch._asdict().items()}
-            loss = {"loss": context_loss + policy_loss}
-            look({"data/context": contexts, **data, "contexts": z, **metrics, **loss})
-            look(self._gradients_and_parameters())
-        return metrics
+        data = {f"data/{name}": values for name, values in batch._asdict().items()}
+        made = {"data/context": contexts, **data, "contexts": z, **metrics, "loss": loss}
+        return metrics, made
 
     def _gradients_and_parameters(self) -> dict[str, Tensor]:
         gradients, parameters = {}, {}
@@ -188,7 +253,10 @@ class Learner:
         factor = LAST_RATE + (1 - LAST_RATE) * left if self.config.decay else 1.0
         for name, optimizer in self.optimizers.items():
             for group, rate in zip(optimizer.param_groups, self._rates[name], strict=True):
-                group["lr"] = rate * factor
+                if isinstance(group["lr"], Tensor):
+                    group["lr"].fill_(rate * factor)
+                else:
+                    group["lr"] = rate * factor
 
     def _modules(self) -> dict[str, nn.Module]:
         return {"method": self.method, "actor_critic": self.actor_critic}
@@ -221,7 +289,9 @@ class Learner:
             groups = optimizer.state_dict()["param_groups"]
             optimizer.load_state_dict({"state": entries, "param_groups": groups})
         if self.actor_critic.multiplier is not None:
-            self.actor_critic.multiplier.value = state["multiplier"]
+            self.actor_critic.multiplier.value.copy_(state["multiplier"])
+        if self._recorded is not None:
+            self._recorded.renew()
 
 
 def _spread(z: Tensor) -> dict[str, Tensor]:

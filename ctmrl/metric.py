@@ -18,7 +18,7 @@ def focal_metric_loss(z: Tensor) -> Tensor:
     Returns:
         Scalar in (0, 10].
     """
-    i, j = torch.triu_indices(len(z), len(z), offset=1)
+    i, j = torch.triu_indices(len(z), len(z), offset=1, device=z.device)
     distance = (z[i] - z[j]).square().mean(dim=1)
     # The field's code divides by the number of pairs plus 1e-3.
     return (1.0 / (distance + 0.1)).sum() / (len(i) + 1e-3)

@@ -44,7 +44,7 @@ def measure_of(config: RunConfig, learner: Learner) -> Measure:
     Beside training that is a copy of the agent, on the cores that are spare.
     """
     beside = measured_beside(config)
-    encoder, actor = learner.method.encoder, learner.actor_critic.actor
+    encoder, actor = learner.agent.method.encoder, learner.agent.actor
     test = MetaTest(
         copy.deepcopy(encoder) if beside else encoder,
         copy.deepcopy(actor) if beside else actor,

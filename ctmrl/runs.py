@@ -44,6 +44,7 @@ LATER_SETTINGS: dict[str, Any] = {
     "quality": "mixed",
     "data_episodes": None,
     "precision": "float32",
+    "device": "cpu",
     "actor_critic": {"behavior_cloning": 0.0, "value_from_data": False},
 }
 """Settings that came after the first runs, and what a run has that does not name them. Where they
@@ -238,7 +239,7 @@ class RunFolder:
     def save_checkpoint(self, state: dict[str, Tensor]) -> None:
         """Replace the checkpoint."""
         # Fresh strings and storages: a pickle's bytes depend on which objects are the same.
-        fresh = {f"{key}": value.detach().clone() for key, value in sorted(state.items())}
+        fresh = {f"{key}": value.detach().cpu().clone() for key, value in sorted(state.items())}
         buffer = io.BytesIO()
         torch.save(fresh, buffer)
         write_whole(self.path / CHECKPOINT, buffer.getvalue())

@@ -74,7 +74,8 @@ def settings_of(
     """What config.json holds: all that decides the run's results."""
     from ctmrl.runs import without_later_settings
 
-    every = dataclasses.asdict(config).items()
+    # Of a device such as cuda:1, what decides the bytes.
+    every = {**dataclasses.asdict(config), "device": learner.device.type}.items()
     return {
         "settings": without_later_settings({k: v for k, v in every if k not in NOT_SETTINGS}),
         "dataset": dataset.hash,
@@ -93,9 +94,11 @@ def check(config: RunConfig) -> Dataset:
     """
     from ctmrl.config import check_settings
     from ctmrl.loggers import check_loggers
+    from ctmrl.meta_train import usable_precision
 
     check_settings(config)
     check_loggers(config.loggers)
+    usable_precision(config)
     return open_data(config)
 
 
@@ -185,7 +188,7 @@ def with_precision(config: RunConfig, path: Path) -> RunConfig:
     if config.precision != "auto":
         return config
     begun = None if config.restart else runs.begun_with(path, "precision")
-    return dataclasses.replace(config, precision=begun or best_precision())
+    return dataclasses.replace(config, precision=begun or best_precision(config.device))
 
 
 def _way_on(folder: RunFolder) -> str:

@@ -1,12 +1,23 @@
-"""The hardware, for learners of behaviour policies and of contexts alike."""
+"""The hardware, for learners of behaviour policies and of contexts alike.
+
+Which precision it multiplies fast, and a function that a GPU records once, as a CUDA graph, and
+then replays without Python.
+"""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from datagen.budgets import Precision
+
+WARM_UP = 3
+"""Calls before a recording, as many as torch's documentation has."""
 
 
 def best_precision(device: torch.device | str = "cpu") -> Precision:
@@ -37,3 +48,69 @@ def check_precision(precision: str, device: str) -> Precision:
     if precision == "auto":
         return best_precision(device)
     return "bfloat16" if precision == "bfloat16" else "float32"
+
+
+class Inlet:
+    """A tensor that stays where it is, for numbers that come from the host."""
+
+    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
+        """Set aside its memory."""
+        self.tensor = torch.zeros(shape, device=device)
+
+    def fill(self, write: Callable[[NDArray[np.float32]], None]) -> None:
+        """Give it what a function writes to an array of its shape, without waiting for a GPU."""
+        if self.tensor.device.type == "cpu":
+            write(self.tensor.numpy())
+            return
+        # Torch gives pinned memory away again only when the copies from it are over.
+        staged = torch.empty(self.tensor.shape, pin_memory=True)
+        write(staged.numpy())
+        self.tensor.copy_(staged, non_blocking=True)
+
+
+def recorded(function: Callable[[], None], device: torch.device) -> Callable[[], None]:
+    """A function as it is on a processor, and recorded where its device is a GPU."""
+    return Recorded(function, device) if device.type == "cuda" else function
+
+
+class Recorded:
+    """A function of a GPU's tensors that is recorded as a CUDA graph, and then replayed.
+
+    It must do the same operations on the same memory each time: it takes and returns nothing, draws
+    no random numbers, and waits for no value. A call is always exactly one of the function: the
+    first few run as they are, on a stream aside, which is the warm-up that a recording needs, and
+    recording itself computes nothing.
+    """
+
+    def __init__(self, function: Callable[[], None], device: torch.device) -> None:
+        """Set up; nothing is called.
+
+        Args:
+            function: what to call.
+            device: the GPU it computes on.
+        """
+        self._function, self._device = function, device
+        self._aside = torch.cuda.Stream(device)  # type: ignore[no-untyped-call] # torch's own
+        self._calls = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        """Call the function once."""
+        self._calls += 1
+        if self._calls <= WARM_UP:
+            self._warm_up()
+            return
+        if self._graph is None:
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph, stream=self._aside):
+                self._function()
+        self._graph.replay()
+
+    def _warm_up(self) -> None:
+        main = torch.cuda.current_stream(self._device)
+        self._aside.wait_stream(main)
+        with torch.cuda.stream(self._aside), warnings.catch_warnings():
+            # Optimisers that can be recorded warn where they are not.
+            warnings.filterwarnings("ignore", ".*capturable=True", UserWarning)
+            self._function()
+        main.wait_stream(self._aside)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ctmrl.networks import ContextEncoder, Encoder, Statistics
+from ctmrl.numbers import Source
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Method(nn.Module, ABC):
 
     @abstractmethod
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+        self, contexts: Tensor, z: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss that trains the encoder.
 
@@ -97,6 +98,14 @@ class Method(nn.Module, ABC):
             all_contexts: draws one fresh task-specific context of every training task, [T, Z].
         """
 
+    @property
+    def phase(self) -> object:
+        """What decides of which operations a step is made; none may depend on values of tensors.
+
+        Where it changes, a step that was recorded for a GPU is recorded anew.
+        """
+        return None
+
     def code_of(self, z: Tensor) -> Tensor | None:
         """Code of each context [*, Z], int64 [*]; None where a method has no codes."""
         return None
@@ -110,7 +119,7 @@ class Reference(Method):
         """What stands in for contexts, without parameters to train."""
 
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+        self, contexts: Tensor, z: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """0, for there is nothing to train."""
-        return torch.zeros(()), {}
+        return torch.zeros((), device=contexts.device), {}

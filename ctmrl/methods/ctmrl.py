@@ -13,6 +13,7 @@ from ctmrl.codebook import Codebook, check_codes, usage
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
 from ctmrl.networks import Predictors, Statistics
+from ctmrl.numbers import Source
 from ctmrl.schedule import COLLECTIONS, Schedule
 
 __all__ = ["COLLECTIONS", "CTMRL", "CTMRLConfig"]
@@ -94,11 +95,16 @@ class CTMRL(Method):
             else:
                 self.codebook.place(contexts, seed=step)
 
+    @property
+    def phase(self) -> bool:
+        """Whether the codebook is in use."""
+        return bool(self.codebook.placed)
+
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+        self, contexts: Tensor, z: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Equations (3) to (10); the codebook's terms are 0 until the warm-up is over."""
-        config, zero = self.config, torch.zeros(())
+        config, zero = self.config, torch.zeros((), device=z.device)
         anchors, positives = z
         tasks, n = contexts.shape[1:3]
         losses = {"spe_prediction": zero, "metric": zero}
@@ -152,7 +158,7 @@ class CTMRL(Method):
             cqvae.state_prediction_loss(predicted[1], targets[1], squared),
         )
         means = per_task.mean(dim=1)
-        return means[0], means[1] if many == 2 else torch.zeros(())
+        return means[0], means[1] if many == 2 else torch.zeros((), device=z.device)
 
     def code_of(self, z: Tensor) -> Tensor:
         """Equation (1)."""

@@ -15,6 +15,7 @@ from ctmrl.ema_codebook import EMACodebook
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
 from ctmrl.networks import Predictors, Statistics
+from ctmrl.numbers import Source
 from ctmrl.schedule import COLLECTIONS, Schedule
 
 
@@ -90,11 +91,9 @@ def bilinear_contrast_loss(
         Scalar.
     """
     same = matched[:, None] == matched[None, :]
-    if same.all():
-        return anchors.new_zeros(())
     logits = positives @ bilinear @ anchors.T
     per_task = logits.masked_fill(~same, -torch.inf).logsumexp(dim=1) - logits.diagonal()
-    return (per_task / same.sum(dim=1)).sum()
+    return torch.where(same.all(), 0.0, (per_task / same.sum(dim=1)).sum())
 
 
 class CTMRLReleased(Method):
@@ -141,15 +140,20 @@ class CTMRLReleased(Method):
             else:
                 book.place(collected, seed=step)
 
+    @property
+    def phase(self) -> bool:
+        """Whether the codebook is in use."""
+        return bool(self.codebook.placed)
+
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+        self, contexts: Tensor, z: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The sum of all terms; the codebook's are 0 until the warm-up is over.
 
         Objectives that the published code gives to separate optimisers share this sum: what must
         not train a network enters its term detached.
         """
-        config, zero = self.config, torch.zeros(())
+        config, zero = self.config, torch.zeros((), device=z.device)
         anchors, positives = z
         encodings = self.encoder.encode(contexts[0])
         mean, variance = self.behavior_model(contexts[0][..., : self.dims.obs + self.dims.act])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
 from ctmrl.networks import Statistics
+from ctmrl.numbers import Source
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class FOCAL(Method):
         self.config = config
 
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: torch.Generator
+        self, contexts: Tensor, z: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted metric loss."""
         metric = focal_metric_loss(z[0])

@@ -14,8 +14,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import Tensor
 from torch.optim import Optimizer
 
+from datagen.accelerator import Inlet, recorded
 from datagen.budgets import Precision, SACSettings
-from datagen.fleet.graph import Inlet, recorded
 from datagen.fleet.memory import FleetMemory
 from datagen.fleet.policy import FleetPolicy
 from datagen.fleet.vec_env import FleetVecEnv

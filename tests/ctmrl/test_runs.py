@@ -101,11 +101,14 @@ def test_settings_that_came_later_are_known_of_earlier_runs(path: Path) -> None:
     with opened(path):
         pass
     # What a run had before there was a choice is no other setting, said or unsaid.
-    with opened(path, changed(quality="mixed", data_episodes=None)):
+    said_before = {"quality": "mixed", "data_episodes": None}
+    with opened(path, changed(**said_before, precision="float32", device="cpu")):
         pass
     for settings, said in (
         (changed(quality="expert"), "settings.quality = mixed, this one has expert"),
         (changed(data_episodes=3), "settings.data_episodes = None, this one has 3"),
+        (changed(precision="bfloat16"), "settings.precision = float32, this one has bfloat16"),
+        (changed(device="cuda"), "settings.device = cpu, this one has cuda"),
     ):
         with pytest.raises(RunError, match=f" holds a run with {said}: choose another --out"):
             RunFolder(path, settings, restart=False)

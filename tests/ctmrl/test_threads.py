@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ def test_the_settings_are_made() -> None:
         assert torch.are_deterministic_algorithms_enabled()
         assert tiny / 100 == 0
         assert not deterministic.fill_uninitialized_memory
+        assert os.environ["CUBLAS_WORKSPACE_CONFIG"] in (":4096:8", ":16:8")
     finally:
         settle_threads(1)
     assert torch.get_num_threads() == 1

@@ -86,6 +86,10 @@ def mistake(
             "contexts need 2 x 4 different episodes a task, the dataset has 6: "
             "collect more or lower --context-episodes",
         ),
+        (
+            ("--device", "gpu"),
+            "--device gpu cannot be used here: learning is on cpu or cuda",
+        ),
         (("--steps", "0"), "--steps must be at least 1, got 0"),
         (("--tau", "nan"), "--tau must be at least 1e-09, got nan"),
         (("--memory", "-1"), "--memory must be at least 0, got -1.0"),
@@ -213,6 +217,8 @@ def test_help_shows_the_options_of_the_method(capsys: pytest.CaptureFixture[str]
         (["--env", "ant-goal"], preset("ant_goal", "ctmrl", "standard", precision="auto")),
         (["--env", "ant-goal", "--precision", "float32"],
          preset("ant_goal", "ctmrl", "standard", precision="float32")),
+        (["--device", "cuda:1"],
+         preset("point_robot_wind", "ctmrl", "standard", device="cuda:1")),
         (["--memory", "1.5"], preset("point_robot_wind", "ctmrl", "standard", memory=1.5)),
         (["--seed", "7", "--data", "d", "--out", "o", "--restart", "--validate"],
          preset("point_robot_wind", "ctmrl", "standard", seed=7, data=Path("d"), out=Path("o"),

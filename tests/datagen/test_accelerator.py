@@ -1,12 +1,19 @@
-"""What the hardware multiplies fast, and devices that are not there."""
+"""What the hardware multiplies fast, devices that are not there, and recorded functions."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from datagen import accelerator
-from datagen.accelerator import best_precision, check_precision
+from datagen.accelerator import WARM_UP, Inlet, best_precision, check_precision, recorded
+from tests.datagen.tape import pretend_cuda
+
+CUDA = torch.device("cuda")
 
 
 def test_the_best_precision_is_that_of_the_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -37,3 +44,41 @@ def test_a_device_that_is_not_there(device: str, precision: str) -> None:
     with pytest.raises(ValueError, match=f"--device {device} cannot be used here: ") as caught:
         check_precision(precision, device)
     assert "\n" not in str(caught.value)
+
+
+def refuse(*about: Any, **more: Any) -> None:
+    raise AssertionError("called")
+
+
+def test_an_inlet_stays_where_it_is() -> None:
+    inlet = Inlet((2, 3), torch.device("cpu"))
+    place, view = inlet.tensor.data_ptr(), inlet.tensor[1]
+    for value in (1.0, 2.0):
+
+        def write(into: NDArray[np.float32], value: float = value) -> None:
+            into[1] = value
+
+        inlet.fill(write)
+        assert inlet.tensor.tolist() == [[0.0] * 3, [value] * 3]
+        assert view.tolist() == [value] * 3
+    assert inlet.tensor.data_ptr() == place
+
+
+def test_on_a_processor_it_is_the_function_itself() -> None:
+    assert recorded(refuse, torch.device("cpu")) is refuse
+
+
+def test_every_call_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    said, total, calls = pretend_cuda(monkeypatch), torch.zeros(2), list[int]()
+
+    def function() -> None:
+        calls.append(1)
+        total.add_(torch.ones(2) * 3)
+
+    call = recorded(function, CUDA)
+    for number in range(1, WARM_UP + 4):
+        call()
+        assert total.tolist() == [3.0 * number] * 2
+    warm_up = ["aside waits for main", "run on aside", "main waits for aside"] * WARM_UP
+    assert said == [*warm_up, "record on aside", "replay", "replay", "replay"]
+    assert len(calls) == WARM_UP + 1

@@ -6,19 +6,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from datagen.accelerator import WARM_UP, Recorded, recorded
 from datagen.budgets import Precision
 from datagen.fleet.algorithm import FleetSAC
-from datagen.fleet.graph import WARM_UP, Inlet, Recorded, recorded
 from datagen.fleet.state import learner_counts, learner_tensors, load_state, restore, save_state
 from tests.datagen.fleet.fleets import NEVER, SETTINGS, fleet
-from tests.datagen.fleet.tape import Tape, pretend_cuda
+from tests.datagen.tape import Tape, pretend_cuda
 
 CUDA = torch.device("cuda")
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -47,40 +45,6 @@ def on_tape(model: FleetSAC) -> FleetSAC:
     """A learner that believes its updates to be a GPU's."""
     model._recorded = recorded(model._update, CUDA)
     return model
-
-
-def test_an_inlet_stays_where_it_is() -> None:
-    inlet = Inlet((2, 3), torch.device("cpu"))
-    place, view = inlet.tensor.data_ptr(), inlet.tensor[1]
-    for value in (1.0, 2.0):
-
-        def write(into: NDArray[np.float32], value: float = value) -> None:
-            into[1] = value
-
-        inlet.fill(write)
-        assert inlet.tensor.tolist() == [[0.0] * 3, [value] * 3]
-        assert view.tolist() == [value] * 3
-    assert inlet.tensor.data_ptr() == place
-
-
-def test_on_a_processor_it_is_the_function_itself() -> None:
-    assert recorded(refuse, torch.device("cpu")) is refuse
-
-
-def test_every_call_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    said, total, calls = pretend_cuda(monkeypatch), torch.zeros(2), list[int]()
-
-    def function() -> None:
-        calls.append(1)
-        total.add_(torch.ones(2) * 3)
-
-    call = recorded(function, CUDA)
-    for number in range(1, WARM_UP + 4):
-        call()
-        assert total.tolist() == [3.0 * number] * 2
-    warm_up = ["aside waits for main", "run on aside", "main waits for aside"] * WARM_UP
-    assert said == [*warm_up, "record on aside", "replay", "replay", "replay"]
-    assert len(calls) == WARM_UP + 1
 
 
 @both
