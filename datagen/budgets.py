@@ -183,8 +183,8 @@ _ROBOT_SAC = SACSettings(
     update_every=20,
     initial_temperature=0.1,
 )
-_ROBOT_STEPS, _ANT_STEPS = 100_000, 40_000
-"""Four times its steps teach the ant a tenth more; docs/fleet.md says what is known of others."""
+_ROBOT_STEPS = {"ant": 40_000, "hopper": 200_000, "walker": 400_000}
+"""By the first word of an environment's name, where it is not 100,000."""
 
 
 def _robot_standard(steps: int) -> Budget:
@@ -225,7 +225,7 @@ _ROBOT_SMOKE = Budget(
 
 
 def _robot_rows(env: str) -> dict[str, Budget]:
-    standard = _robot_standard(_ANT_STEPS if env.startswith("ant") else _ROBOT_STEPS)
+    standard = _robot_standard(_ROBOT_STEPS.get(env.partition("_")[0], 100_000))
     return {row.name: row for row in (_ROBOT_PAPER, standard, _ROBOT_SMOKE)}
 
 

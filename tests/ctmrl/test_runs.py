@@ -127,7 +127,7 @@ def test_settings_that_came_later_are_left_out_where_they_change_nothing() -> No
         "actor_critic": {"gamma": 0.5, "value_from_data": True},
     }
     assert without_later_settings(settings) == kept
-    assert with_later_settings(kept) == settings | {"precision": "float32"}
+    assert with_later_settings(kept) == LATER_SETTINGS | settings
     assert with_later_settings({})["actor_critic"] == LATER_SETTINGS["actor_critic"]
 
 
