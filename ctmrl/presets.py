@@ -96,8 +96,8 @@ GOAL: Settings = {
     "predictor_hidden": (128, 128),
 }
 SQUARED: Settings = {"squared_errors": True}
-# Sized for a small machine. The dual KL divergence holds a policy back only after many more steps
-# than these; docs/methods/actor_critic.md has what was compared, which is no search yet.
+# Sized for a small machine. docs/methods/actor_critic.md compares what holds a policy to the data;
+# the rest is not searched yet.
 ROBOT: Settings = {
     "steps": 10_000,
     "precision": "auto",

@@ -44,10 +44,10 @@ def measure_of(config: RunConfig, learner: Learner) -> Measure:
     Beside training that is a copy of the agent, on the cores that are spare.
     """
     beside = measured_beside(config)
-    encoder, actor = learner.agent.method.encoder, learner.agent.actor
+    agent = copy.deepcopy(learner.agent) if beside else learner.agent
     test = MetaTest(
-        copy.deepcopy(encoder) if beside else encoder,
-        copy.deepcopy(actor) if beside else actor,
+        agent.method.encoder,
+        agent.actor,
         task_set(config.env),
         dataclasses.replace(config.meta_test, repetitions=1),
         config.seed,
