@@ -87,7 +87,9 @@ def test_critics_begin_at_the_value_of_the_data_on_request(
     assert reward < -0.1
     for plain, moved in zip(*values, strict=True):
         # No episode of this robot ends before its time.
-        torch.testing.assert_close(moved - plain, torch.full_like(plain, float(reward) / (1 - gamma)))
+        torch.testing.assert_close(
+            moved - plain, torch.full_like(plain, float(reward) / (1 - gamma))
+        )
 
 
 def modules(learner: Learner) -> nn.ModuleDict:
