@@ -54,8 +54,9 @@ class CollectConfig:
 
     env: str
     """Environment: its short name, its id or the field's hyphenated name."""
-    budget: Annotated[str, tyro.conf.arg(metavar="paper|standard|smoke")] = "standard"
-    """How much to collect: as in the papers, to suit a small machine, or just enough to test."""
+    budget: Annotated[str, tyro.conf.arg(metavar="paper|standard|quick|smoke")] = "standard"
+    """How much to collect: as in the papers, to suit a small machine, no more of a MuJoCo robot
+    than that learns in an hour or so, or just enough to test."""
     tasks: Annotated[str | None, tyro.conf.arg(metavar="0-9,12")] = None
     """Tasks to collect; all by default."""
     shard: Annotated[str | None, tyro.conf.arg(metavar="I/N")] = None

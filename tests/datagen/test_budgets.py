@@ -14,7 +14,7 @@ from tests.meta_envs.robots import MUJOCO_ROBOTS, POINT_ROBOTS
 
 
 @pytest.mark.parametrize("env", ["point_robot", "PointRobotWind-v0", "sparse-point-robot"])
-@pytest.mark.parametrize("name", ["paper", "standard"])
+@pytest.mark.parametrize("name", ["paper", "standard", "quick"])
 def test_point_robots_follow_the_protocol(env: str, name: str) -> None:
     found = budget(env, name)
     assert found.name == name
@@ -26,8 +26,8 @@ def test_point_robots_follow_the_protocol(env: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("env", [*POINT_ROBOTS, *MUJOCO_ROBOTS])
-def test_every_environment_has_the_three_budgets(env: str) -> None:
-    assert list(BUDGETS[env]) == ["paper", "standard", "smoke"]
+def test_every_environment_has_the_four_budgets(env: str) -> None:
+    assert list(BUDGETS[env]) == ["paper", "standard", "quick", "smoke"]
     for name, row in BUDGETS[env].items():
         assert row.name == name
         # Checkpoints fall between two bursts of updates, so that each policy has had updates.
@@ -37,8 +37,10 @@ def test_every_environment_has_the_three_budgets(env: str) -> None:
 
 
 @pytest.mark.parametrize("env", MUJOCO_ROBOTS)
-def test_robots_follow_the_protocol_at_fewer_steps(env: str) -> None:
-    field, found = budget(env, "paper"), budget(env, "standard")
+@pytest.mark.parametrize("name", ["standard", "quick"])
+def test_robots_follow_the_protocol_at_fewer_steps(env: str, name: str) -> None:
+    field, found = budget(env, "paper"), budget(env, name)
+    assert name == "standard" or found.steps == 40_000
     assert (field.steps, field.random_steps, field.episodes) == (1_000_000, 50_000, 50)
     # The same shares of the training: random steps, early checkpoints and late ones.
     marks, theirs = np.array(found.checkpoints), np.array(field.checkpoints)
