@@ -99,7 +99,7 @@ SQUARED: Settings = {"squared_errors": True}
 # Sized for a small machine. docs/methods/actor_critic.md compares what holds a policy to the data;
 # the rest is not searched yet.
 ROBOT: Settings = {
-    "steps": 10_000,
+    "steps": 2_000,
     "precision": "auto",
     "batch_size": 64,
     "context_size": 128,
@@ -110,7 +110,7 @@ ROBOT: Settings = {
     "reward_scale": 50.0,
     "learning_rate": 5e-4,
     "target_rate": 0.02,
-    "behavior_cloning": 0.2,
+    "behavior_cloning": 0.5,
     "value_from_data": True,
     "random_episodes": 2,
     "policy_episodes": 2,
