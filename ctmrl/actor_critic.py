@@ -53,6 +53,9 @@ class ActorCriticConfig:
     behavior_cloning: float = 0.0
     """Weight of minus the log likelihood of the data's actions in the policy's loss, in units of
     the spread of Q: what TD3+BC is for a deterministic policy. 0 is without it."""
+    cloning_advantage: float = 0.0
+    """How much more actions count in cloning that are better than the policy's: by e to this many
+    times their advantage, in units of its spread. 0 clones all alike."""
     value_from_data: bool = False
     """Let critics and value network begin at the value that the data's mean reward comes to, and
     not at 0, from where they take thousands of steps."""
@@ -143,13 +146,15 @@ class ActorCritic(nn.Module):
         sample = self.actor.sample(batch.obs, z, generator)
         q = self.critic(batch.obs, sample.action, z, layers=frozen(layers)).amin(dim=0)
         entropy_cost = self.entropy_coef * sample.log_prob
-        value = (self.value(batch.obs, z)[0] - (q - entropy_cost).detach()).square().mean()
+        expected = self.value(batch.obs, z)[0]
+        value = (expected - (q - entropy_cost).detach()).square().mean()
         regularizer = sample.mean.square().mean() + sample.log_std.square().mean()
         actor = (entropy_cost - q).mean()
         actor = actor + self.entropy_coef * self.config.regularizer * regularizer
         cloning = self.config.behavior_cloning
         if cloning:
-            unlikely = -sample.log_prob_of(batch.action).mean()
+            weights = self.cloning_weights((at_data.amin(dim=0) - expected).detach())
+            unlikely = -(weights * sample.log_prob_of(batch.action)).mean()
             actor = actor + cloning * q.detach().std() * unlikely
         metrics = {
             "policy/q": q.detach().mean(),
@@ -173,6 +178,18 @@ class ActorCritic(nn.Module):
             metrics["divergence/mean"] = divergence.detach().mean()
             metrics["divergence/coefficient"] = coefficient
         return critic + value + actor, metrics
+
+    def cloning_weights(self, advantage: Tensor) -> Tensor:
+        """Weights of a batch's actions in cloning, 1 on the mean; both [n].
+
+        They are advantage-weighted regression's (AWR and AWAC, where the spread is a temperature),
+        normalised over the batch, so that they hold the policy as firmly when all advantages fall.
+        """
+        strength = self.config.cloning_advantage
+        if not strength:
+            return torch.ones_like(advantage)
+        spread = advantage.std().clamp(min=1e-6)
+        return torch.softmax(strength * advantage / spread, dim=0) * len(advantage)
 
     def critic_target(self, batch: Transitions, z: Tensor) -> Tensor:
         """Targets y = r + gamma V_target(s', z), no value behind a terminal transition; [n]."""

@@ -96,21 +96,22 @@ GOAL: Settings = {
     "predictor_hidden": (128, 128),
 }
 SQUARED: Settings = {"squared_errors": True}
-# Sized for a small machine. docs/methods/actor_critic.md compares what holds a policy to the data;
-# the rest is not searched yet.
+# Sized for minutes of a small machine. docs/methods/actor_critic.md compares what holds a policy to
+# the data; the rest was not searched.
 ROBOT: Settings = {
-    "steps": 2_000,
+    "steps": 3_000,
     "precision": "auto",
-    "batch_size": 64,
-    "context_size": 128,
+    "batch_size": 16,
+    "context_size": 64,
     "encoder_hidden": (128, 128),
     "predictor_hidden": (128, 128),
     "hidden": (256, 256),
     "gamma": 0.98,
     "reward_scale": 50.0,
     "learning_rate": 5e-4,
-    "target_rate": 0.02,
+    "target_rate": 0.01,
     "behavior_cloning": 0.5,
+    "cloning_advantage": 1.0,
     "value_from_data": True,
     "random_episodes": 2,
     "policy_episodes": 2,

@@ -131,8 +131,12 @@ def test_the_actors_and_the_value_networks_losses_are_the_fields_divided_by_r(br
     assert metrics["policy/entropy"].item() == pytest.approx(entropy, rel=1e-6)
 
 
-def test_behaviour_cloning_is_of_the_data_in_units_of_the_spread_of_q() -> None:
-    plain, cloning = actor_critic(), actor_critic(behavior_cloning=0.7)
+@pytest.mark.parametrize("strength", [0.0, 1.3])
+def test_behaviour_cloning_is_of_the_better_data_in_units_of_the_spread_of_q(
+    strength: float,
+) -> None:
+    plain = actor_critic()
+    cloning = actor_critic(behavior_cloning=0.7, cloning_advantage=strength)
     cloning.load_state_dict(plain.state_dict())
     rows, z = double_batch(), contexts()
     old = copy.deepcopy(cloning)
@@ -140,7 +144,13 @@ def test_behaviour_cloning_is_of_the_data_in_units_of_the_spread_of_q() -> None:
     metrics = after_a_backward_pass(cloning, rows, z)
     mean, log_std = old.actor(rows.obs, z)
     policy = TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform())
-    unlikely = -policy.log_prob(rows.action).sum(dim=1).mean()  # type: ignore[no-untyped-call]
+    with torch.no_grad():
+        advantage = old.critic(rows.obs, rows.action, z).amin(dim=0) - old.value(rows.obs, z)[0]
+        weights = (strength * advantage / advantage.std()).exp()
+        weights /= weights.mean()
+    assert strength == 0 or weights.max() > 1.5 * weights.min()
+    log_prob = policy.log_prob(rows.action).sum(dim=1)  # type: ignore[no-untyped-call]
+    unlikely = -(weights * log_prob).mean()
     sampled = old.actor.sample(rows.obs, z, generator(1)).action
     spread = old.critic(rows.obs, sampled, z).amin(dim=0).std().item()
     assert spread > 0.01

@@ -122,7 +122,9 @@ def test_numbers_that_do_not_fit_are_refused(changes: dict[str, object], fault: 
 
 
 def test_unknown_names_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"no budget 'huge' \(known: paper, standard, quick, smoke\)"):
+    with pytest.raises(
+        ValueError, match=r"no budget 'huge' \(known: paper, standard, quick, smoke\)"
+    ):
         budget("point-robot", "huge")
     with pytest.raises(ValueError, match="did you mean 'point_robot'"):
         budget("point_robott", "paper")
