@@ -30,6 +30,12 @@ from ctmrl.train import best_behavior, parse, train
 from datagen.dataset import open_dataset
 
 RESULTS = Path(__file__).parent / "results"
+SETTINGS = (
+    *("--batch-size", "64", "--context-size", "128", "--target-rate", "0.02"),
+    *("--gamma", "0.98", "--learning-rate", "5e-4", "--value-from-data"),
+    *("--cloning-advantage", "0"),
+)
+"""Of all runs, whatever the preset."""
 CLONING = ("--no-behavior-regularization", "--reward-scale", "50", "--behavior-cloning")
 HELD: dict[str, tuple[str, ...]] = {
     "nothing": (*CLONING, "0"),
@@ -107,7 +113,7 @@ def main() -> int:
     """Run the benchmark."""
     options = tyro.cli(Benchmark)
     common: list[Any] = ["--env", options.env, "--method", "oracle_task"]
-    common += ["--steps", options.steps, "--data", options.data / options.env]
+    common += ["--steps", options.steps, "--data", options.data / options.env, *SETTINGS]
     results = []
     for seed in options.seeds:
         for name, words in HELD.items():
