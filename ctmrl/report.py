@@ -36,6 +36,7 @@ LABELS = {
     "oracle": "oracle (exact optimum)",
     "best_behavior": "best behaviour policy",
     "wind_blind": "wind-blind controller",
+    "still": "standing still",
     "random": "random",
 }
 TITLES = {
@@ -121,7 +122,7 @@ def _draw_curve(axes: Axes, name: str, group: dict[str, Any], record: dict[str, 
     axes.plot(
         np.arange(len(mean)), mean, color=color, lw=2, marker="o", ms=4, label=record["method"]
     )
-    styles = {"oracle": "-", "best_behavior": "-.", "wind_blind": "--"}
+    styles = {"oracle": "-", "best_behavior": "-.", "wind_blind": "--", "still": ":"}
     for key, style in styles.items():
         if key in group["references"]:
             value = group["references"][key]
@@ -225,7 +226,7 @@ def summary_table(env: str, group: str, results: list[Result]) -> Table:
             f"{result.returns.mean():.3f}",
             f"{low:.3f} to {high:.3f}" if len(result.seeds) > 1 else "-",
             f"{interquartile_mean(result.returns):.3f}",
-            f"{result.scores.mean():.1f}",
+            "-" if np.isnan(result.scores).any() else f"{result.scores.mean():.1f}",
             " ".join(map(str, result.seeds)),
             style="" if result.note else "bold",
         )

@@ -150,12 +150,12 @@ def interquartile_mean(values: NDArray[np.float64]) -> float:
 
 
 def to_csv(results: list[Result]) -> str:
-    """One line a seed: environment, method, group, seed, return, score."""
+    """One line a seed: environment, method, group, seed, return, score (empty: there is none)."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(["env", "method", "group", "seed", "return", "score"])
     for result in results:
         for seed, value, score in zip(result.seeds, result.returns, result.scores, strict=True):
             row = [result.env, result.method, result.group, seed]
-            writer.writerow([*row, f"{value:.4f}", f"{score:.2f}"])
+            writer.writerow([*row, f"{value:.4f}", "" if np.isnan(score) else f"{score:.2f}"])
     return buffer.getvalue()

@@ -216,6 +216,17 @@ def test_the_summary_table() -> None:
     assert cells(summary_table("point_robot_wind", "seen", single))["ctmrl"][1] == "-"
 
 
+def test_what_has_no_score_and_what_stands_still() -> None:
+    run = {**record(), "run": "runs/a"}
+    for group in run["groups"].values():
+        group["references"] = {"random": -30.0, "still": -20.0}
+        group["score"] = None
+    rows = cells(summary_table("half_cheetah_vel", "seen", collate([run])[:1]))
+    assert rows["ctmrl"][3] == "-"
+    assert rows["standing still"][:4] == ["-20.000", "", "", "-"]
+    assert cells(result_table(run))["standing still"] == ["-20.00", "-", "-20.00", "-"]
+
+
 def test_a_reference_is_called_one_in_every_table() -> None:
     made = record("oracle_task") | {"note": "reference, given the true task"}
     title = "oracle_task (reference, given the true task)"

@@ -100,6 +100,14 @@ def test_a_missing_score_is_nan() -> None:
     assert math.isnan(collate([one])[0].scores[0])
 
 
+def test_a_missing_score_is_an_empty_cell_of_the_csv() -> None:
+    runs = [of_run()]
+    for group in runs[0]["groups"].values():
+        group["score"] = None
+    rows = list(csv.DictReader(to_csv(collate(runs)).splitlines()))
+    assert [row["score"] for row in rows] == ["", ""]
+
+
 def test_two_runs_of_one_seed_are_one_sentence() -> None:
     with pytest.raises(UsageError, match=r"^a and b both have seed 4 of ctmrl on point_robot_wind"):
         collate([of_run("a", seed=4), of_run("b", seed=4)])
