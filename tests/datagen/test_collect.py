@@ -176,7 +176,7 @@ def test_a_damaged_file_is_named(folder: Path, capsys: Capture) -> None:
     ("options", "sentence"),
     [
         (["--env", "point_robot_wimd"], "did you mean 'point_robot_wind'?"),
-        (["--budget", "big"], "has no budget 'big' (known: paper, standard, smoke)"),
+        (["--budget", "big"], "has no budget 'big' (known: paper, standard, quick, smoke)"),
         (["--tasks", "3-"], "--tasks takes numbers and ranges such as 0-9,12, got '3-'"),
         (["--tasks", "49-50"], "has tasks 0 to 49, got '49-50'"),
         (["--shard", "2/2"], "--shard takes i/n with i from 0 to n - 1"),
