@@ -186,7 +186,7 @@ _ROBOT_SAC = SACSettings(
 _ROBOT_STEPS = {"ant": 40_000, "hopper": 200_000, "walker": 400_000}
 """Of the standard budget, by the first word of an environment's name, where not 100,000."""
 _QUICK_STEPS = 40_000
-"""Of the quick budget, which teaches a good half of what the standard one does."""
+"""Of the quick budget, which teaches half or more of what the standard one does."""
 
 
 def _robot_budget(name: str, steps: int) -> Budget:
