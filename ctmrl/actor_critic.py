@@ -55,7 +55,8 @@ class ActorCriticConfig:
     the spread of Q: what TD3+BC is for a deterministic policy. 0 is without it."""
     cloning_advantage: float = 0.0
     """How much more actions count in cloning that are better than the policy's: by e to this many
-    times their advantage, in units of its spread. 0 clones all alike."""
+    times their advantage, in units of its spread. 0 clones all alike. Of no use without
+    behavior_cloning."""
     value_from_data: bool = False
     """Let critics and value network begin at the value that the data's mean reward comes to, and
     not at 0, from where they take thousands of steps."""

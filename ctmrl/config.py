@@ -113,6 +113,15 @@ class RunConfig:
 
 
 _SHARE = (0.0, 1.0)
+_WEIGHTS = (
+    "code_contrast",
+    "cross_prediction",
+    "contrast",
+    "metric",
+    "club",
+    "commitment",
+    "cycle",
+)
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("steps", "batch_size", "context_episodes", "context_size"), (1, math.inf)),
     **dict.fromkeys(("scored_episodes", "repetitions", "threads", "z_dim"), (1, math.inf)),
@@ -121,6 +130,9 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("learning_rate", "encoder_lr", "dual_lr", "regularizer"), (0, math.inf)),
     **dict.fromkeys(("gamma", "target_rate", "eta", "warm_up", "refresh"), _SHARE),
     **dict.fromkeys(("reward_scale", "tau"), (1e-9, math.inf)),
+    **dict.fromkeys(("behavior_cloning", "cloning_advantage"), (0, math.inf)),
+    **dict.fromkeys((f"{name}_weight" for name in _WEIGHTS), (0, math.inf)),
+    **dict.fromkeys(("divergence_initial", "divergence_maximum"), (0, math.inf)),
     "code_decay": _SHARE,
     "data_episodes": (1, math.inf),
     "meta_batch": (2, math.inf),
