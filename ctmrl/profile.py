@@ -38,7 +38,7 @@ PEAK_SIZE, PEAK_TIMES = 2048, 6
 LEAST_FLOPS = 1_000_000
 """Fewer are not shown: a part of fewer does something else."""
 SYNTHETIC_STEPS = 4_000
-"""Transitions a task where there is no dataset."""
+"""Transitions a task where there is no dataset, or as many as its contexts need."""
 
 
 @dataclass(frozen=True)
@@ -257,9 +257,10 @@ def open_or_make(config: RunConfig, console: Console) -> OfflineData:
             f"python -m datagen.collect --env {config.env} collects it.",
             soft_wrap=True,
         )
-        dataset: Dataset = synthetic_dataset(
-            config.env, SYNTHETIC_STEPS // resolve(config.env).horizon
-        )
+        enough = SYNTHETIC_STEPS // resolve(config.env).horizon
+        # A gradient step draws two contexts of a task.
+        episodes = max(enough, 2 * config.training.context_episodes)
+        dataset: Dataset = synthetic_dataset(config.env, episodes)
     else:
         dataset = open_data(config)
     return OfflineData(dataset, dataset.train_tasks)

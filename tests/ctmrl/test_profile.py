@@ -13,11 +13,13 @@ from rich.console import Console
 from torch import nn
 
 from ctmrl import profile as module
+from ctmrl import synthetic
 from ctmrl.console import run_command
 from ctmrl.data import OfflineData
 from ctmrl.meta_train import Learner
 from ctmrl.methods.ctmrl import CTMRL
 from ctmrl.networks import Critic
+from ctmrl.presets import preset
 from ctmrl.profile import (
     REST,
     Part,
@@ -155,6 +157,21 @@ def test_without_a_dataset_it_says_so(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "python -m datagen.collect --env point_robot" in text
     assert "point_robot, focal, smoke: " in text
     assert "GFLOP/s in bfloat16, 1 thread." in text
+
+
+@pytest.mark.parametrize("env", ["half_cheetah_vel", "point_robot"])
+def test_random_numbers_are_enough_for_the_contexts(
+    env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def short(env: str, episodes: int) -> synthetic.SyntheticDataset:
+        return dataclasses.replace(real(env, episodes), horizon=2)
+
+    real = synthetic.synthetic_dataset
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(synthetic, "synthetic_dataset", short)
+    config = preset(env, "ctmrl", "paper")
+    data = module.open_or_make(config, Console(file=io.StringIO()))
+    data.check_episodes(CTMRL.context_sets, config.training.context_episodes)
 
 
 @pytest.mark.parametrize(
