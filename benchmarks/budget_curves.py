@@ -6,8 +6,8 @@ Collects train tasks of an environment with the standard budget's fleet, but for
 steps (killed and run again, it goes on). A policy's worth after a number of steps is the mean
 return of its last three checkpoints above the random policy's; the table has its mean over tasks,
 and its share of what four times these steps reach. Writes
-benchmarks/results/budget_curves_ENV.csv, and docs/results/budget_curves.png with all environments
-that have such a file.
+benchmarks/results/budget_curves_ENV_STEPS.csv, and docs/results/budget_curves.png with all such
+files.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ LAST = 3
 """So many checkpoints are averaged: a policy's return goes up and down between two of them."""
 ENOUGH = 0.9
 """Share of what four times the steps reach that a budget must reach."""
+ACROSS = 3
+"""Panels side by side in the picture."""
 FIRST = ("task", "random")
 """Columns of a file before those of the checkpoints."""
 
@@ -53,7 +55,7 @@ class BudgetCurves:
     work: Path
     """Folder for the datasets, outside the repository."""
     steps: int | None = None
-    """Last step, a multiple of 1,600; four times the standard budget's by default."""
+    """Last step, a multiple of 800; four times the standard budget's by default."""
     tasks: int = 8
     """Number of train tasks, spread over them."""
     fleet_size: int = 8
@@ -102,11 +104,13 @@ def long_budget(env: str, steps: int | None) -> Budget:
     """
     row = budget(env, "standard")
     steps = TIMES * row.steps if steps is None else steps
-    unit = 2 * CHECKPOINTS * row.sac.update_every
+    unit = CHECKPOINTS * row.sac.update_every
     if steps < unit or steps % unit:
         raise ValueError(f"--steps must be a multiple of {unit}, got {steps}")
-    marks = tuple(steps * part // CHECKPOINTS for part in range(1, CHECKPOINTS + 1))
-    return replace(row, name="curves", steps=steps, random_steps=marks[0] // 2, checkpoints=marks)
+    random = row.random_steps * steps // (TIMES * row.steps)
+    marks = (steps * part // CHECKPOINTS for part in range(1, CHECKPOINTS + 1))
+    learnt = tuple(mark for mark in marks if mark > random)
+    return replace(row, name="curves", steps=steps, random_steps=random, checkpoints=learnt)
 
 
 def measure(options: BudgetCurves, console: Console) -> Curves:
@@ -124,7 +128,7 @@ def measure(options: BudgetCurves, console: Console) -> Curves:
     row = engine_of(row, CollectConfig(name, fleet_size=options.fleet_size))
     train = task_set(name).train_tasks
     tasks = train[np.linspace(0, len(train) - 1, options.tasks).round().astype(int)]
-    groups, folder = row.groups(tasks.tolist()), options.work / name
+    groups, folder = row.groups(tasks.tolist()), options.work / f"{name}_{row.steps}"
     plan = Plan(name, groups, row, 0, folder, os.cpu_count() or 1)
     records = collect(plan, console)["tasks"]
     return Curves(
@@ -157,26 +161,30 @@ def read(path: Path) -> Curves:
 
 
 def draw(path: Path) -> None:
-    """The picture: a panel an environment, the checkpoints' returns and the best so far."""
+    """The picture: a panel an experiment, tasks and their mean; dashed, the standard budget."""
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     files = sorted(RESULTS.glob("budget_curves_*.csv"))
+    rows = -(-len(files) // ACROSS)
     figure, panels = pyplot.subplots(
-        1, len(files), figsize=(3.2 * len(files), 3), layout="constrained", squeeze=False
+        rows, ACROSS, figsize=(3.2 * ACROSS, 2.6 * rows), layout="constrained", squeeze=False
     )
-    for axes, file in zip(panels[0], files, strict=True):
+    for axes in panels.flat[len(files) :]:
+        axes.set_axis_off()
+    for axes, file in zip(panels.flat, files, strict=False):
         curves = read(file)
         steps = curves.marks / 1000
         axes.plot(steps, curves.returns.T, color="#3b6ea5", alpha=0.25, linewidth=0.8)
         mean = curves.returns.mean(axis=0)
         axes.plot(steps, mean, color="#c1666b", label="mean over tasks")
         axes.axhline(curves.random.mean(), color="0.6", linestyle=":", label="random")
-        name = file.stem.removeprefix("budget_curves_")
+        name = file.stem.removeprefix("budget_curves_").rpartition("_")[0]
         axes.axvline(budget(name, "standard").steps / 1000, color="0.3", linestyle="--")
-        axes.set(xlabel="thousand steps", title=resolve(name).id)
+        axes.set_title(f"{resolve(name).id}, {len(curves.tasks)} tasks", fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
-    panels[0][0].set_ylabel("behaviour policy's return")
+    figure.supxlabel("thousand steps", fontsize=9)
+    figure.supylabel("behaviour policy's return", fontsize=9)
     panels[0][0].legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=120, metadata={"Software": None})
 
@@ -219,7 +227,7 @@ def main() -> int:
         codes = {CollectionError: 1, InterruptedCollectionError: 130}
         return codes.get(type(error), 2)
     name = resolve(options.env).name
-    write(curves, RESULTS / f"budget_curves_{name}.csv")
+    write(curves, RESULTS / f"budget_curves_{name}_{curves.marks[-1]}.csv")
     draw(ROOT / "docs/results/budget_curves.png")
     report(curves, f"{resolve(name).id}: {len(curves.tasks)} train tasks", Console())
     return 0
