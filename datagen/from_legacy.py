@@ -73,6 +73,7 @@ def from_legacy(
     if not wanted.folder.is_dir():
         raise DatasetError(wanted.folder, "is no folder", "give the one with goal_idx0 in it")
     found = _chosen(list_legacy(wanted.folder), wanted, task_set(env))
+    _check_checkpoints(found, wanted.folder)
     source = probe(env, found[0])
     deterministic = all(
         _checkpoints(one.deterministic) >= _checkpoints(one.stochastic) for one in found
@@ -99,6 +100,19 @@ def _chosen(found: Sequence[LegacyTask], wanted: Import, tasks: TaskSet) -> list
             place = wanted.folder / f"goal_idx{task}"
             raise DatasetError(place, "is not there", "choose other --tasks")
     return [there[task] for task in asked]
+
+
+def _check_checkpoints(found: Sequence[LegacyTask], folder: Path) -> None:
+    """Raise a DatasetError that names a task with other checkpoints than the first one has."""
+    first, *others = found
+    for other in others:
+        differ = _checkpoints(first.stochastic) ^ _checkpoints(other.stochastic)
+        if differ:
+            place, marks = folder / f"goal_idx{other.task}", ", ".join(map(str, sorted(differ)))
+            fault = (
+                f"has other checkpoints than goal_idx{first.task}: only one of the two has {marks}"
+            )
+            raise DatasetError(place, fault, "choose other --tasks")
 
 
 @contextmanager

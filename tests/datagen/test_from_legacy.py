@@ -136,6 +136,15 @@ def test_what_does_not_fit_is_refused(legacy: Path, tmp_path: Path) -> None:
     refused(legacy, tmp_path / "out", f"goal_idx3/{path.name}: its pickle")
 
 
+def test_tasks_with_other_checkpoints_are_refused(legacy: Path, tmp_path: Path) -> None:
+    for path in (legacy / "goal_idx2").glob("*_step200.npy"):
+        path.unlink()
+    fault = "goal_idx2: has other checkpoints than goal_idx0: only one of the two has 200; choose"
+    refused(legacy, tmp_path / "out", fault)
+    convert(legacy, tmp_path / "out", tasks="0,3")
+    convert(legacy, tmp_path / "alone", tasks="2")
+
+
 def test_what_is_there_is_not_touched(legacy: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "kept.txt").write_text("kept")
