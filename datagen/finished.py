@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -119,12 +121,12 @@ def without_versions(origin: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def remove_stale(folder: Path, over: Collection[str] = ()) -> None:
-    """Delete what writers that are no more left half written.
+    """Delete files and folders that writers that are no more left half written.
 
     Whether a writer on another machine lives cannot be told from here, so what it left stays.
 
     Args:
-        folder: whose files.
+        folder: what they are in.
         over: names of files that nobody writes any more, on whatever machine.
     """
     if not folder.is_dir():
@@ -132,7 +134,16 @@ def remove_stale(folder: Path, over: Collection[str] = ()) -> None:
     for path in folder.iterdir():
         match = _PARTIAL.fullmatch(path.name)
         if match and (match[1] in over or (match[2] == machine() and not _alive(int(match[3])))):
-            path.unlink(missing_ok=True)
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Delete a file, a link, or a folder with all that is in it, unless another process does."""
+    with suppress(FileNotFoundError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def remove_states(folder: Path) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from datagen.dataset import COLUMNS, FORMAT_VERSION, DatasetError, TaskData, task_file, write_task
 from datagen.files import IMPORTED, partial_of, sync_folder
-from datagen.finished import write_summary
+from datagen.finished import remove_stale, write_summary
 from datagen.legacy_episodes import Columns, Source, probe, to_columns
 from datagen.legacy_files import LegacyFile, LegacyTask, list_legacy, read_episode
 from datagen.plan import parse_tasks
@@ -121,6 +121,7 @@ def _whole_folder(out: Path) -> Iterator[Path]:
     if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(out, "is there already", "delete it or choose another --out")
     place = Path(os.path.abspath(out))
+    remove_stale(place.parent)
     partial = partial_of(place)
     partial.mkdir(parents=True)
     try:

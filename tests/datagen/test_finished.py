@@ -118,6 +118,20 @@ def test_what_dead_writers_left_is_removed(tmp_path: Path) -> None:
     assert [path.exists() for path in paths] == [False, True, True, False, True]
 
 
+def test_a_folder_that_a_dead_writer_left_is_removed(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    folder, link = (tmp_path / f".{name}.{machine()}.{ended.pid}.partial" for name in ("a", "b"))
+    put_in = tmp_path / "kept"
+    for place in (folder, put_in):
+        place.mkdir()
+        (place / "task_000.h5").write_text("half")
+    link.symlink_to(put_in)
+    remove_stale(tmp_path)
+    assert list(tmp_path.iterdir()) == [put_in]
+    assert [path.name for path in put_in.iterdir()] == ["task_000.h5"]
+
+
 def test_trainings_of_finished_tasks_are_removed(tmp_path: Path) -> None:
     put(tmp_path, 1)
     put(tmp_path, 2)
