@@ -18,7 +18,7 @@ import tyro
 from rich.console import Console
 
 from datagen.budgets import Budget, budget
-from datagen.dataset import task_file
+from datagen.dataset import DatasetError, task_file
 from datagen.estimate import seconds_of
 from datagen.finished import (
     check_origin,
@@ -202,7 +202,8 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
 
     Raises:
         ValueError: the folder cannot be made or written to, or there is no Ray.
-        DatasetError: a file in the folder is damaged or was collected in another way.
+        DatasetError: a file in the folder is damaged or was collected in another way, or the folder
+            cannot be read.
         CollectionError: a worker failed or a file could not be written.
         InterruptedCollectionError: Ctrl-C.
     """
@@ -250,7 +251,7 @@ def _collect(plan: Plan, console: Console) -> dict[str, Any]:
     try:
         remove_stale(plan.folder, states | {task_file(task) for task in plan.tasks})
         remove_states(plan.folder)
-    except OSError as error:
+    except (DatasetError, OSError) as error:
         raise CollectionError(
             f"the dataset is complete, but what its making left cannot be removed ({error})"
         ) from error

@@ -6,14 +6,13 @@ import os
 import re
 import shutil
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from datagen.card import CARD_FILE, card
 from datagen.dataset import DatasetError, task_file, task_of, write_index
-from datagen.files import digest, machine, read_bytes, write_whole
+from datagen.files import digest, machine, read_bytes, unreadable, write_whole
 from datagen.job import STATE_FILES
 from datagen.task_files import parse_task
 
@@ -58,11 +57,21 @@ def read_finished(path: Path) -> Finished:
 
 
 def task_paths(folder: Path) -> list[Path]:
-    """Paths of all task files in a folder, by task; none if there is no folder."""
-    if not folder.is_dir():
-        return []
-    found = ((task_of(path), path) for path in folder.iterdir())
+    """Paths of all task files in a folder, by task; none if there is no folder.
+
+    Raises:
+        DatasetError: the folder cannot be read.
+    """
+    found = ((task_of(path), path) for path in _listed(folder))
     return [path for task, path in sorted((t, p) for t, p in found if t is not None)]
+
+
+def _listed(folder: Path) -> list[Path]:
+    """What is in a folder; nothing if there is no folder."""
+    try:
+        return list(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise unreadable(folder, error) from error
 
 
 def scan(folder: Path, origin: Mapping[str, Any]) -> dict[int, Finished]:
@@ -128,10 +137,11 @@ def remove_stale(folder: Path, over: Collection[str] = ()) -> None:
     Args:
         folder: what they are in.
         over: names of files that nobody writes any more, on whatever machine.
+
+    Raises:
+        DatasetError: the folder cannot be read, or something in it cannot be deleted.
     """
-    if not folder.is_dir():
-        return
-    for path in folder.iterdir():
+    for path in _listed(folder):
         match = _PARTIAL.fullmatch(path.name)
         if match and (match[1] in over or (match[2] == machine() and not _alive(int(match[3])))):
             _remove(path)
@@ -139,11 +149,16 @@ def remove_stale(folder: Path, over: Collection[str] = ()) -> None:
 
 def _remove(path: Path) -> None:
     """Delete a file, a link, or a folder with all that is in it, unless another process does."""
-    with suppress(FileNotFoundError):
+    try:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
             path.unlink()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        fault = f"is half written and cannot be deleted ({error.strerror or error})"
+        raise DatasetError(path, fault, "delete it") from error
 
 
 def remove_states(folder: Path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +132,33 @@ def test_a_folder_that_a_dead_writer_left_is_removed(tmp_path: Path) -> None:
     remove_stale(tmp_path)
     assert list(tmp_path.iterdir()) == [put_in]
     assert [path.name for path in put_in.iterdir()] == ["task_000.h5"]
+
+
+@pytest.mark.parametrize("use", [remove_stale, lambda folder: scan(folder, ORIGIN)])
+def test_a_folder_that_cannot_be_read_is_an_error(
+    use: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(folder: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(DatasetError) as caught:
+        use(tmp_path)
+    sentence = "cannot be read (Permission denied); check its permissions and the disk"
+    assert str(caught.value) == f"{tmp_path}: {sentence}"
+
+
+def test_what_cannot_be_deleted_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
+
+    path = tmp_path / ".task_003.h5.elsewhere.1.partial"
+    path.write_text("half")
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(DatasetError, match=r"deleted \(Operation not permitted\); delete it$"):
+        remove_stale(tmp_path, {"task_003.h5"})
 
 
 def test_trainings_of_finished_tasks_are_removed(tmp_path: Path) -> None:
