@@ -29,7 +29,7 @@ from datagen.finished import (
     write_summary,
 )
 from datagen.groups import rows_text
-from datagen.job import Job, group_file, origin
+from datagen.job import Job, group_file, origin, policy_file
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration
 from datagen.stages import collect_tasks, train_groups
@@ -213,12 +213,19 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
 
 def _collect(plan: Plan, console: Console) -> dict[str, Any]:
     _prepare(plan.folder)
-    if plan.policies is not None:
-        _prepare(plan.policies, "--policies")
     missing = missing_tasks(plan)
+    if plan.policies is not None and missing:
+        _prepare(plan.policies, "--policies")
     finished = len(plan.tasks) - len(missing)
     if finished:
         console.print(f"{finished} of {len(plan.tasks)} tasks are already finished.")
+    lost = _lost_policies(plan, missing)
+    if lost:
+        _say(
+            console,
+            f"The policies of finished tasks are not kept: {plan.policies} will have none of "
+            f"{rows_text(lost)}, collect to another --out to have them.",
+        )
     if plan.ray is None and len(missing) * plan.budget.updates >= LONG:
         _say(console, _estimate(plan, missing))
     jobs = [
@@ -256,6 +263,15 @@ def _collect(plan: Plan, console: Console) -> dict[str, Any]:
             f"the dataset is complete, but what its making left cannot be removed ({error})"
         ) from error
     return index
+
+
+def _lost_policies(plan: Plan, missing: Sequence[int]) -> list[int]:
+    """Finished tasks whose policies are asked for and were not written when they were trained."""
+    folder = plan.policies
+    if folder is None:
+        return []
+    finished = [task for task in plan.tasks if task not in missing]
+    return [task for task in finished if not policy_file(folder, task).exists()]
 
 
 def _cluster(plan: Plan) -> AbstractContextManager[None]:
