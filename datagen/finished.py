@@ -100,15 +100,19 @@ def scan(folder: Path, origin: Mapping[str, Any]) -> dict[int, Finished]:
 
 def check_origin(one: Finished, origin: Mapping[str, Any]) -> None:
     """Raise a DatasetError that names the first difference of a file from what was asked for."""
-    there = dict(_leaves({key: one.meta.get(key) for key in origin}))
-    asked = dict(_leaves(origin))
-    for key in sorted({*there, *asked}):
-        if there.get(key) != asked.get(key):
-            raise DatasetError(
-                one.path,
-                f"was collected with {key} {_value(there, key)}, not {_value(asked, key)}",
-                "give the same options as then, choose another --out, or delete the file",
-            )
+    found = difference({key: one.meta.get(key) for key in origin}, origin)
+    if found:
+        remedy = "give the same options as then, choose another --out, or delete the file"
+        raise DatasetError(one.path, f"was collected with {found}", remedy)
+
+
+def difference(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+    """The first difference of an origin from what was asked for, `seed 5, not 6`; "" if none."""
+    theirs, ours = dict(_leaves(there)), dict(_leaves(asked))
+    for key in sorted({*theirs, *ours}):
+        if theirs.get(key) != ours.get(key):
+            return f"{key} {_value(theirs, key)}, not {_value(ours, key)}"
+    return ""
 
 
 def _leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
