@@ -19,7 +19,7 @@ from rich.console import Console
 
 from datagen.budgets import Budget, budget
 from datagen.dataset import DatasetError, task_file
-from datagen.estimate import seconds_of
+from datagen.estimate import seconds_of, state_bytes
 from datagen.finished import (
     check_origin,
     remove_stale,
@@ -318,6 +318,9 @@ def describe(plan: Plan, console: Console) -> None:
         "episodes": f"{budget.episodes} each checkpoint, {budget.total_episodes:,} a task",
         "size": f"at most {rows:,} rows, {rows * plan.row_bytes / 1e6:.1f} MB",
     }
+    beside = state_bytes(plan, missing)
+    if beside:
+        lines["meanwhile"] = f"up to {beside / 1e6:,.1f} MB beside it, until all tasks are done"
     for name, text in lines.items():
         _say(console, f"{name + ':':13}{text}")
     if missing:

@@ -216,6 +216,8 @@ def test_a_dry_run_touches_nothing(
         "tasks:       0-1,5-7 (5 tasks, 5 to collect)",
         "groups:      2 of 2 or 3 tasks",
     ]
+    line = r"meanwhile:   up to \d\.\d MB beside it, until all tasks are done"
+    assert re.fullmatch(line, lines[-2])
     assert not (folder / "new").exists()
 
 
