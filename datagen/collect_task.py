@@ -61,6 +61,8 @@ def collect_task(job: Job, report: Callable[[int], None] = lambda step: None) ->
         The `returns` of the file's meta.
 
     Raises:
+        DatasetError: the file of the task's group is damaged, of another training, not finished or
+            not there.
         OSError: the file could not be written; nothing is left of it.
     """
     policies = _policies(job, report)

@@ -26,6 +26,8 @@ from datagen.fleet.vec_env import FleetVecEnv
 class FleetSAC(OffPolicyAlgorithm):
     """Stable-Baselines3's SAC, one a task, all updated by one set of batched operations.
 
+    Soft actor-critic is of Haarnoja et al. 2018 (arXiv 1801.01290), with two critics and a
+    temperature that is learnt as in their second paper (arXiv 1812.05905).
     The tasks share no parameter, transition, statistic or random number. As in Stable-Baselines3,
     steps are counted over all sub-environments: `learn(n * len(tasks))` is n steps of each task.
     """
