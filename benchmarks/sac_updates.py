@@ -10,9 +10,11 @@ Python of an environment of its own (`pip install sbx-rl` and this project).
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
-from contextlib import ExitStack
+import tempfile
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,21 +72,30 @@ class Group:
     """The processes of one side."""
 
     def __init__(self, python: str, arguments: list[str], processes: int, tasks: int) -> None:
-        """Start them and wait until all learn."""
+        """Start them and wait until all learn.
+
+        Raises:
+            RuntimeError: one of them ended.
+        """
         threads = dict.fromkeys(THREAD_VARIABLES, "1")
         threads["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        self.errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
         self.members = [
             subprocess.Popen(
                 [python, str(SIDE), *arguments, "--first-task", str(tasks * number)],
                 env={**os.environ, **threads},
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
+                stderr=self.errors,
                 text=True,
             )
             for number in range(processes)
         ]
-        self._answers()
+        try:
+            self._answers()
+        except BaseException:
+            self.close()
+            raise
 
     def _answers(self) -> float:
         total = 0.0
@@ -92,23 +103,37 @@ class Group:
             assert member.stdout is not None
             line = member.stdout.readline()
             if not line:
-                raise RuntimeError(f"a process ended: {member.args!r}")
+                raise RuntimeError(f"{SIDE.name} ended: {self._last_words()}")
             total += float(line)
         return total
 
+    def _last_words(self) -> str:
+        """The last line of what the processes said went wrong."""
+        self.errors.seek(0)
+        lines = self.errors.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it did not say why"
+
     def learn(self, seconds: float) -> float:
-        """Updates a second of all processes together, for so long."""
+        """Updates a second of all processes together, for so long.
+
+        Raises:
+            RuntimeError: one of them ended.
+        """
         for member in self.members:
             assert member.stdin is not None
-            member.stdin.write(f"{seconds}\n")
-            member.stdin.flush()
+            # One that has ended does not answer.
+            with suppress(BrokenPipeError):
+                member.stdin.write(f"{seconds}\n")
+                member.stdin.flush()
         return self._answers()
 
     def close(self) -> None:
         """End them."""
         for member in self.members:
             member.kill()
-            member.wait()
+            with suppress(BrokenPipeError):
+                member.communicate()
+        self.errors.close()
 
 
 def measure(case: tuple[str, int, int, int], options: Benchmark) -> list[Result]:
@@ -144,16 +169,32 @@ def measure(case: tuple[str, int, int, int], options: Benchmark) -> list[Result]
     ]
 
 
+def _check(options: Benchmark) -> None:
+    if min(options.processes, options.repetitions) < 1 or options.seconds <= 0:
+        raise ValueError("--processes, --repetitions and --seconds must be above 0")
+    if options.sbx is not None and shutil.which(options.sbx) is None:
+        raise ValueError(f"--sbx {options.sbx}: there is no such program")
+    if options.out is not None and not options.out.parent.is_dir():
+        raise ValueError(f"--out {options.out}: there is no folder {options.out.parent}")
+
+
 def main() -> int:
-    """Run the benchmark."""
-    options, console = tyro.cli(Benchmark), Console()
-    results = []
+    """Run the benchmark; exit code 1 where a side ended, 2 for a mistake, 130 for Ctrl-C."""
+    options = tyro.cli(Benchmark, prog="python benchmarks/sac_updates.py")
+    console, errors = Console(), Console(stderr=True)
+    try:
+        _check(options)
+        results = [one for case in CASES for one in measure(case, options)]
+    except (ValueError, RuntimeError) as error:
+        errors.print(str(error), soft_wrap=True, markup=False, highlight=False)
+        return 2 if isinstance(error, ValueError) else 1
+    except KeyboardInterrupt:
+        errors.print("Interrupted; nothing was written.")
+        return 130
     table = Table("environment", "layers", "batch", "engine", "tasks", "updates/s", "/ sb3")
-    for case in CASES:
-        for one in measure(case, options):
-            results.append(one)
-            cells = (one.batch, one.engine, one.tasks, one.updates, one.ratio)
-            table.add_row(one.env, f"2 x {one.hidden}", *map(str, cells))
+    for one in results:
+        cells = (one.batch, one.engine, one.tasks, one.updates, one.ratio)
+        table.add_row(one.env, f"2 x {one.hidden}", *map(str, cells))
     console.print(table)
     if options.out is not None:
         write_results(options.out, results, {})

@@ -154,11 +154,6 @@ def _about(index: Mapping[str, Any]) -> list[str]:
     env, records = index["env"], index["tasks"]
     row = resolve(env)
     names = ", ".join(f"`{name}`" for name in index["param_names"])
-    expert = (
-        "the exact optimum"
-        if "oracle" in definition(env).controllers
-        else "the task's best deterministic checkpoint"
-    )
     return [
         f"# {index['env_id']}: offline meta-reinforcement-learning data",
         "",
@@ -167,9 +162,20 @@ def _about(index: Mapping[str, Any]) -> list[str]:
         f"An episode has at most {row.horizon} steps.",
         "",
         *(_import_text(index) if _is_legacy(index) else _collection_text(index)),
-        f"Returns are undiscounted sums of `rewards`, means over tasks; the expert is {expert}.",
+        "Returns are undiscounted sums of `rewards`, means over tasks; the expert is "
+        f"{_expert(index)}.",
         "",
     ]
+
+
+def _expert(index: Mapping[str, Any]) -> str:
+    if "oracle" in definition(index["env"]).controllers:
+        return "the exact optimum"
+    best = "the task's best deterministic checkpoint"
+    if _is_legacy(index):
+        return best
+    marks = len(index["config"]["checkpoints"])
+    return f"{best}, the best of {marks} that played one episode each, so it is optimistic"
 
 
 def _collection_text(index: Mapping[str, Any]) -> list[str]:

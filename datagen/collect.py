@@ -18,8 +18,8 @@ import tyro
 from rich.console import Console
 
 from datagen.budgets import Budget, budget
-from datagen.dataset import task_file
-from datagen.estimate import seconds_of
+from datagen.dataset import DatasetError, task_file
+from datagen.estimate import seconds_of, state_bytes
 from datagen.finished import (
     check_origin,
     remove_stale,
@@ -29,7 +29,7 @@ from datagen.finished import (
     write_summary,
 )
 from datagen.groups import rows_text
-from datagen.job import Job, group_file, origin
+from datagen.job import Job, group_file, origin, policy_file
 from datagen.plan import Plan, parse_shard, parse_tasks
 from datagen.progress import CollectionDisplay, duration
 from datagen.stages import collect_tasks, train_groups
@@ -202,7 +202,8 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
 
     Raises:
         ValueError: the folder cannot be made or written to, or there is no Ray.
-        DatasetError: a file in the folder is damaged or was collected in another way.
+        DatasetError: a file in the folder is damaged or was collected in another way, or the folder
+            cannot be read.
         CollectionError: a worker failed or a file could not be written.
         InterruptedCollectionError: Ctrl-C.
     """
@@ -212,12 +213,19 @@ def collect(plan: Plan, console: Console) -> dict[str, Any]:
 
 def _collect(plan: Plan, console: Console) -> dict[str, Any]:
     _prepare(plan.folder)
-    if plan.policies is not None:
-        _prepare(plan.policies, "--policies")
     missing = missing_tasks(plan)
+    if plan.policies is not None and missing:
+        _prepare(plan.policies, "--policies")
     finished = len(plan.tasks) - len(missing)
     if finished:
         console.print(f"{finished} of {len(plan.tasks)} tasks are already finished.")
+    lost = _lost_policies(plan, missing)
+    if lost:
+        _say(
+            console,
+            f"The policies of finished tasks are not kept: {plan.policies} will have none of "
+            f"{rows_text(lost)}, collect to another --out to have them.",
+        )
     if plan.ray is None and len(missing) * plan.budget.updates >= LONG:
         _say(console, _estimate(plan, missing))
     jobs = [
@@ -250,11 +258,20 @@ def _collect(plan: Plan, console: Console) -> dict[str, Any]:
     try:
         remove_stale(plan.folder, states | {task_file(task) for task in plan.tasks})
         remove_states(plan.folder)
-    except OSError as error:
+    except (DatasetError, OSError) as error:
         raise CollectionError(
             f"the dataset is complete, but what its making left cannot be removed ({error})"
         ) from error
     return index
+
+
+def _lost_policies(plan: Plan, missing: Sequence[int]) -> list[int]:
+    """Finished tasks whose policies are asked for and were not written when they were trained."""
+    folder = plan.policies
+    if folder is None:
+        return []
+    finished = [task for task in plan.tasks if task not in missing]
+    return [task for task in finished if not policy_file(folder, task).exists()]
 
 
 def _cluster(plan: Plan) -> AbstractContextManager[None]:
@@ -301,6 +318,9 @@ def describe(plan: Plan, console: Console) -> None:
         "episodes": f"{budget.episodes} each checkpoint, {budget.total_episodes:,} a task",
         "size": f"at most {rows:,} rows, {rows * plan.row_bytes / 1e6:.1f} MB",
     }
+    beside = state_bytes(plan, missing)
+    if beside:
+        lines["meanwhile"] = f"up to {beside / 1e6:,.1f} MB beside it, until all tasks are done"
     for name, text in lines.items():
         _say(console, f"{name + ':':13}{text}")
     if missing:

@@ -10,7 +10,7 @@ import numpy as np
 
 from datagen.dataset import TaskData, task_file, write_task
 from datagen.groups import rows_text
-from datagen.job import Job, Stream, origin
+from datagen.job import Job, Stream, origin, policy_file
 from datagen.rollout import episode_returns, join, rollout
 from meta_envs import TaskSet, reference_returns, task_set
 
@@ -42,7 +42,7 @@ def _export(job: Job, folder: Path) -> None:
     from datagen.fleet.export import export_policy, sac_of
     from datagen.fleet.training import trained_networks
 
-    path = folder / f"{task_file(job.task).removesuffix('.h5')}.zip"
+    path = policy_file(folder, job.task)
     export_policy(path, sac_of(job.env, job.task, job.budget, trained_networks(job)))
 
 
@@ -61,6 +61,8 @@ def collect_task(job: Job, report: Callable[[int], None] = lambda step: None) ->
         The `returns` of the file's meta.
 
     Raises:
+        DatasetError: the file of the task's group is damaged, of another training, not finished or
+            not there.
         OSError: the file could not be written; nothing is left of it.
     """
     policies = _policies(job, report)

@@ -1,4 +1,4 @@
-"""How long a collection would take, from a second or two of it."""
+"""How long a collection would take, from a second or two of it, and what its trainings store."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,3 +101,29 @@ def seconds_of(plan: Plan, missing: Sequence[int]) -> float:
     learning = budget.updates * update * -(-jobs // plan.workers)
     rollouts = len(budget.checkpoints) * seconds_a_rollout(plan.env, budget.episodes)
     return START_SECONDS + learning + rollouts * -(-len(missing) // plan.workers)
+
+
+def state_bytes(plan: Plan, missing: Sequence[int]) -> int:
+    """Most bytes of the files that a plan's trainings go on from, as long as tasks are missing.
+
+    Of the groups that are trained at once, the file before stays until the file of a checkpoint is
+    whole, and each holds the replay memory so far. A group's last file has none.
+    """
+    sizes = [len(group) for group in plan.groups if not set(missing).isdisjoint(group)]
+    if plan.budget.fleet is None:
+        return 0
+    env, budget = definition(plan.env), plan.budget
+    obs, acts = env.observation_space.shape[0], env.action_space.shape[0]
+    actor = _parameters((obs, *budget.sac.hidden, 2 * acts))
+    critic = _parameters((obs + acts, *budget.sac.hidden, 1))
+    # Rows of `FleetMemory`.
+    memory = (2 * obs + acts + 2) * sum(budget.checkpoints[-3:-1])
+    # Adam's two averages beside each, two target critics, and the actor at every checkpoint.
+    networks = (3 + len(budget.checkpoints)) * actor + 8 * critic
+    training = sum(sorted(sizes)[-plan.workers :])
+    return 4 * (training * (memory + 2 * networks) + (sum(sizes) - training) * networks)
+
+
+def _parameters(sizes: Sequence[int]) -> int:
+    """Weights and biases of a network with layers of so many units."""
+    return sum((a + 1) * b for a, b in pairwise(sizes))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 from datagen.card import CARD_FILE, card
 from datagen.dataset import DatasetError, task_file, task_of, write_index
-from datagen.files import digest, machine, read_bytes, write_whole
+from datagen.files import digest, machine, read_bytes, unreadable, write_whole
 from datagen.job import STATE_FILES
 from datagen.task_files import parse_task
 
@@ -56,11 +57,21 @@ def read_finished(path: Path) -> Finished:
 
 
 def task_paths(folder: Path) -> list[Path]:
-    """Paths of all task files in a folder, by task; none if there is no folder."""
-    if not folder.is_dir():
-        return []
-    found = ((task_of(path), path) for path in folder.iterdir())
+    """Paths of all task files in a folder, by task; none if there is no folder.
+
+    Raises:
+        DatasetError: the folder cannot be read.
+    """
+    found = ((task_of(path), path) for path in _listed(folder))
     return [path for task, path in sorted((t, p) for t, p in found if t is not None)]
+
+
+def _listed(folder: Path) -> list[Path]:
+    """What is in a folder; nothing if there is no folder."""
+    try:
+        return list(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise unreadable(folder, error) from error
 
 
 def scan(folder: Path, origin: Mapping[str, Any]) -> dict[int, Finished]:
@@ -89,15 +100,19 @@ def scan(folder: Path, origin: Mapping[str, Any]) -> dict[int, Finished]:
 
 def check_origin(one: Finished, origin: Mapping[str, Any]) -> None:
     """Raise a DatasetError that names the first difference of a file from what was asked for."""
-    there = dict(_leaves({key: one.meta.get(key) for key in origin}))
-    asked = dict(_leaves(origin))
-    for key in sorted({*there, *asked}):
-        if there.get(key) != asked.get(key):
-            raise DatasetError(
-                one.path,
-                f"was collected with {key} {_value(there, key)}, not {_value(asked, key)}",
-                "give the same options as then, choose another --out, or delete the file",
-            )
+    found = difference({key: one.meta.get(key) for key in origin}, origin)
+    if found:
+        remedy = "give the same options as then, choose another --out, or delete the file"
+        raise DatasetError(one.path, f"was collected with {found}", remedy)
+
+
+def difference(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+    """The first difference of an origin from what was asked for, `seed 5, not 6`; "" if none."""
+    theirs, ours = dict(_leaves(there)), dict(_leaves(asked))
+    for key in sorted({*theirs, *ours}):
+        if theirs.get(key) != ours.get(key):
+            return f"{key} {_value(theirs, key)}, not {_value(ours, key)}"
+    return ""
 
 
 def _leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
@@ -119,20 +134,35 @@ def without_versions(origin: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def remove_stale(folder: Path, over: Collection[str] = ()) -> None:
-    """Delete what writers that are no more left half written.
+    """Delete files and folders that writers that are no more left half written.
 
     Whether a writer on another machine lives cannot be told from here, so what it left stays.
 
     Args:
-        folder: whose files.
+        folder: what they are in.
         over: names of files that nobody writes any more, on whatever machine.
+
+    Raises:
+        DatasetError: the folder cannot be read, or something in it cannot be deleted.
     """
-    if not folder.is_dir():
-        return
-    for path in folder.iterdir():
+    for path in _listed(folder):
         match = _PARTIAL.fullmatch(path.name)
         if match and (match[1] in over or (match[2] == machine() and not _alive(int(match[3])))):
-            path.unlink(missing_ok=True)
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Delete a file, a link, or a folder with all that is in it, unless another process does."""
+    try:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        fault = f"is half written and cannot be deleted ({error.strerror or error})"
+        raise DatasetError(path, fault, "delete it") from error
 
 
 def remove_states(folder: Path) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from datagen.dataset import COLUMNS, FORMAT_VERSION, DatasetError, TaskData, task_file, write_task
 from datagen.files import IMPORTED, partial_of, sync_folder
-from datagen.finished import write_summary
+from datagen.finished import remove_stale, write_summary
 from datagen.legacy_episodes import Columns, Source, probe, to_columns
 from datagen.legacy_files import LegacyFile, LegacyTask, list_legacy, read_episode
 from datagen.plan import parse_tasks
@@ -73,6 +73,7 @@ def from_legacy(
     if not wanted.folder.is_dir():
         raise DatasetError(wanted.folder, "is no folder", "give the one with goal_idx0 in it")
     found = _chosen(list_legacy(wanted.folder), wanted, task_set(env))
+    _check_checkpoints(found, wanted.folder)
     source = probe(env, found[0])
     deterministic = all(
         _checkpoints(one.deterministic) >= _checkpoints(one.stochastic) for one in found
@@ -101,12 +102,26 @@ def _chosen(found: Sequence[LegacyTask], wanted: Import, tasks: TaskSet) -> list
     return [there[task] for task in asked]
 
 
+def _check_checkpoints(found: Sequence[LegacyTask], folder: Path) -> None:
+    """Raise a DatasetError that names a task with other checkpoints than the first one has."""
+    first, *others = found
+    for other in others:
+        differ = _checkpoints(first.stochastic) ^ _checkpoints(other.stochastic)
+        if differ:
+            place, marks = folder / f"goal_idx{other.task}", ", ".join(map(str, sorted(differ)))
+            fault = (
+                f"has other checkpoints than goal_idx{first.task}: only one of the two has {marks}"
+            )
+            raise DatasetError(place, fault, "choose other --tasks")
+
+
 @contextmanager
 def _whole_folder(out: Path) -> Iterator[Path]:
     """A folder to write to that takes the place of `out` once all is well, and else vanishes."""
     if os.path.lexists(out) and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(out, "is there already", "delete it or choose another --out")
     place = Path(os.path.abspath(out))
+    remove_stale(place.parent)
     partial = partial_of(place)
     partial.mkdir(parents=True)
     try:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from datagen.budgets import Budget
-from datagen.dataset import FORMAT_VERSION
+from datagen.dataset import FORMAT_VERSION, task_file
 from datagen.files import digest
 from meta_envs import resolve, task_set
 
@@ -72,6 +72,11 @@ def group_file(folder: Path, group: tuple[int, ...]) -> Path:
     """The file of a group's training, no part of the dataset; it goes when its tasks are done."""
     name = digest(",".join(map(str, group)))[:8]
     return folder / f".fleet_{group[0]:03d}-{group[-1]:03d}_{name}.safetensors"
+
+
+def policy_file(folder: Path, task: int) -> Path:
+    """The file of a task's last policy in the folder for them, such as `task_003.zip`."""
+    return folder / f"{task_file(task).removesuffix('.h5')}.zip"
 
 
 def versions() -> dict[str, str]:

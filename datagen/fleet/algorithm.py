@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from io import BufferedIOBase
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,8 @@ from datagen.fleet.vec_env import FleetVecEnv
 class FleetSAC(OffPolicyAlgorithm):
     """Stable-Baselines3's SAC, one a task, all updated by one set of batched operations.
 
+    Soft actor-critic is of Haarnoja et al. 2018 (arXiv 1801.01290), with two critics and a
+    temperature that is learnt as in their second paper (arXiv 1812.05905).
     The tasks share no parameter, transition, statistic or random number. As in Stable-Baselines3,
     steps are counted over all sub-environments: `learn(n * len(tasks))` is n steps of each task.
     """
@@ -117,6 +121,22 @@ class FleetSAC(OffPolicyAlgorithm):
     def record(self) -> None:
         """Have the updates recorded anew, because tensors were replaced, as optimisers' are."""
         self._recorded = recorded(self._update, self.device)
+
+    def save(
+        self,
+        path: str | Path | BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Refused: Stable-Baselines3's file of a fleet could not be loaded.
+
+        Raises:
+            NotImplementedError: always, before anything is written.
+        """
+        raise NotImplementedError(
+            "a fleet's state is saved by datagen.fleet.state, its policies by --policies of "
+            "datagen.collect"
+        )
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

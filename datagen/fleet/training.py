@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from datagen.behavior import REPORT_EVERY, Policy
 from datagen.files import DatasetError
+from datagen.finished import difference
 from datagen.fleet.algorithm import FleetSAC
 from datagen.fleet.state import (
     learner_counts,
@@ -171,8 +172,10 @@ def _read(path: Path, wanted: dict[str, Any]) -> tuple[dict[str, Tensor], dict[s
         if isinstance(error, DatasetError):
             raise
         raise DatasetError(path, str(error), "delete it to train its tasks again") from error
-    if about.get("origin") != wanted:
-        raise _foreign(path, "is of a collection with other options or package versions")
+    there = about.get("origin")
+    found = difference(there if isinstance(there, Mapping) else {}, wanted)
+    if found:
+        raise _foreign(path, f"is of a collection with {found}")
     return tensors, about
 
 

@@ -54,18 +54,32 @@ class FleetVecEnv(VecEnv):
         return self._start_seeds
 
     def reset(self) -> NDArray[np.float32]:
-        """Start an episode of every task."""
+        """Start an episode of every task.
+
+        Returns:
+            Observations [task, O], float32.
+        """
         obs, _ = self._many.reset(seed=self._start_seeds)
         self._start_seeds = [None] * self.num_envs
         self._returns[:], self._lengths[:] = 0.0, 0
         return obs
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Keep the actions for `step_wait`."""
+        """Keep the actions for `step_wait`.
+
+        Args:
+            actions: [task, A], in [-1, 1].
+        """
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """One step of every task."""
+        """One step of every task, with the actions of `step_async`.
+
+        Returns:
+            Observations [task, O] and rewards [task], float32; whether the episode ended [task];
+            and a dict a task, empty inside an episode. Where one ended, the observation is the
+            first of the next.
+        """
         assert self._actions is not None, "step_async() comes first"
         obs, reward, terminated, truncated, info = self._many.step(self._actions)
         paid = info["dense_reward"] if self._sparse else reward

@@ -131,6 +131,14 @@ def test_a_fleets_settings_are_in_the_card(index: dict[str, Any]) -> None:
     assert card(json.loads(json.dumps({**index, "config": config}, sort_keys=True))) == text
 
 
+def test_the_card_says_what_the_expert_is(index: dict[str, Any]) -> None:
+    start = "means over tasks; the expert is"
+    assert f"{start} the exact optimum.\n" in card(index)
+    robots = {**index, **origin("hopper_params", budget("hopper_params", "standard"), 0)}
+    of_18 = "the task's best deterministic checkpoint, the best of 18 that played one episode each"
+    assert f"{start} {of_18}, so it is optimistic.\n" in card(robots)
+
+
 def record(behavior: dict[str, float], **more: float) -> dict[str, Any]:
     deterministic = {mark: value + 1 for mark, value in behavior.items()}
     returns = {"random": -30.0, "expert": -5.0, **more}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +118,47 @@ def test_what_dead_writers_left_is_removed(tmp_path: Path) -> None:
     assert [path.exists() for path in paths] == [False, True, True, True, True]
     remove_stale(tmp_path, {"task_006.h5"})
     assert [path.exists() for path in paths] == [False, True, True, False, True]
+
+
+def test_a_folder_that_a_dead_writer_left_is_removed(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    folder, link = (tmp_path / f".{name}.{machine()}.{ended.pid}.partial" for name in ("a", "b"))
+    put_in = tmp_path / "kept"
+    for place in (folder, put_in):
+        place.mkdir()
+        (place / "task_000.h5").write_text("half")
+    link.symlink_to(put_in)
+    remove_stale(tmp_path)
+    assert list(tmp_path.iterdir()) == [put_in]
+    assert [path.name for path in put_in.iterdir()] == ["task_000.h5"]
+
+
+@pytest.mark.parametrize("use", [remove_stale, lambda folder: scan(folder, ORIGIN)])
+def test_a_folder_that_cannot_be_read_is_an_error(
+    use: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(folder: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(DatasetError) as caught:
+        use(tmp_path)
+    sentence = "cannot be read (Permission denied); check its permissions and the disk"
+    assert str(caught.value) == f"{tmp_path}: {sentence}"
+
+
+def test_what_cannot_be_deleted_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
+
+    path = tmp_path / ".task_003.h5.elsewhere.1.partial"
+    path.write_text("half")
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(DatasetError, match=r"deleted \(Operation not permitted\); delete it$"):
+        remove_stale(tmp_path, {"task_003.h5"})
 
 
 def test_trainings_of_finished_tasks_are_removed(tmp_path: Path) -> None:

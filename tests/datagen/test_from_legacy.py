@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -136,12 +139,37 @@ def test_what_does_not_fit_is_refused(legacy: Path, tmp_path: Path) -> None:
     refused(legacy, tmp_path / "out", f"goal_idx3/{path.name}: its pickle")
 
 
+def test_tasks_with_other_checkpoints_are_refused(legacy: Path, tmp_path: Path) -> None:
+    for path in (legacy / "goal_idx2").glob("*_step200.npy"):
+        path.unlink()
+    fault = "goal_idx2: has other checkpoints than goal_idx0: only one of the two has 200; choose"
+    refused(legacy, tmp_path / "out", fault)
+    convert(legacy, tmp_path / "out", tasks="0,3")
+    convert(legacy, tmp_path / "alone", tasks="2")
+
+
 def test_what_is_there_is_not_touched(legacy: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "kept.txt").write_text("kept")
     with pytest.raises(DatasetError, match="is there already; delete it or choose another --out"):
         convert(legacy, tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["kept.txt"]
+
+
+def test_what_a_killed_import_left_is_removed(legacy: Path, tmp_path: Path) -> None:
+    code = (
+        "import os, signal\nfrom pathlib import Path\n"
+        "from datagen.from_legacy import Import, from_legacy\n"
+        "def done(task): os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"wanted = Import(Path({str(legacy)!r}), {ENV!r}, Path({str(tmp_path / 'out')!r}))\n"
+        "from_legacy(wanted, print, done)"
+    )
+    killed = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = tmp_path.glob(".out.*.partial")
+    assert [path.name for path in left.iterdir()] == ["task_000.h5"]
+    convert(legacy, tmp_path / "out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["legacy", "out"]
 
 
 def test_a_full_disk_leaves_nothing(legacy: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import Tensor, nn
@@ -299,6 +300,17 @@ def test_a_callback_stops_it() -> None:
     assert model.num_timesteps == 21
     assert watch.seen[-1] == 21
     assert model._n_updates == 0
+
+
+def test_it_is_not_saved_to_a_file_that_nothing_opens(tmp_path: Path) -> None:
+    model = fleet((0, 1), "point_robot_wind")
+    sentence = "a fleet's state is saved by datagen.fleet.state, its policies by --policies of data"
+    with pytest.raises(NotImplementedError, match=sentence):
+        model.save(tmp_path / "model")
+    often = CheckpointCallback(1, str(tmp_path / "often"))
+    with pytest.raises(NotImplementedError, match=sentence):
+        model.learn(2, often, log_interval=NEVER)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_the_same_seeds_give_the_same_bytes() -> None:

@@ -89,11 +89,14 @@ def test_a_second_run_does_nothing(hoppers: Path, tmp_path: Path, capsys: Captur
     assert contents(folder) == contents(hoppers)
 
 
-def test_policies_are_kept_where_asked(hoppers: Path, tmp_path: Path) -> None:
+def test_policies_are_kept_where_asked(hoppers: Path, tmp_path: Path, capsys: Capture) -> None:
     out, kept = tmp_path / "data", tmp_path / "policies"
     assert main([*HOPPERS, "--out", str(out), "--policies", str(kept)]) == 0
     assert contents(out) == contents(hoppers)
     assert sorted(contents(kept)) == [f"task_{task:03d}.zip" for task in range(3)]
+    capsys.readouterr()
+    assert main([*HOPPERS, "--out", str(out), "--policies", str(kept)]) == 0
+    assert "not kept" not in capsys.readouterr().out, "they are there"
     data = open_dataset(out).read(1)
     loaded = SAC.load(kept / "task_001.zip", device="cpu")
     envs = MetaVectorEnv("hopper_params", tasks=[1])
@@ -105,6 +108,19 @@ def test_policies_are_kept_where_asked(hoppers: Path, tmp_path: Path) -> None:
         total, over = total + float(reward[0]), bool(terminated[0] or truncated[0])
     # The return of its mean action, as the file has it.
     assert total == pytest.approx(data.meta["returns"]["deterministic"]["400"], rel=1e-3)
+
+
+def test_policies_of_finished_tasks_are_said_not_to_be_kept(
+    hoppers: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    folder, kept = shutil.copytree(hoppers, tmp_path / "data"), tmp_path / "kept"
+    assert main([*HOPPERS, "--out", str(folder), "--policies", str(kept)]) == 0
+    sentence = (
+        f"The policies of finished tasks are not kept: {kept} will have none of 0-2, collect to "
+        "another --out to have them."
+    )
+    assert capsys.readouterr().out.splitlines()[1] == sentence
+    assert not kept.exists()
 
 
 @pytest.mark.parametrize("engine", ["fleet", pytest.param("sb3", marks=pytest.mark.slow)])

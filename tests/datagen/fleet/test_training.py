@@ -19,7 +19,7 @@ from datagen.budgets import Budget, FleetSettings
 from datagen.files import DatasetError
 from datagen.fleet import training
 from datagen.fleet.algorithm import FleetSAC
-from datagen.fleet.state import load_state
+from datagen.fleet.state import load_state, save_state
 from datagen.fleet.training import (
     FleetJob,
     Reports,
@@ -193,26 +193,47 @@ def test_a_damaged_file_is_named(
 
 
 @pytest.mark.parametrize(
-    ("seed", "rows"),
+    ("seed", "rows", "difference"),
     [
-        (1, TINY),
-        (0, replace(TINY, episodes=9)),
-        (0, replace(TINY, sac=replace(TINY.sac, gamma=0.5))),
-        (0, replace(TINY, fleet=FleetSettings(2, "bfloat16"))),
-        (0, replace(TINY, fleet=FleetSettings(9, "float32"))),
-        (0, replace(TINY, fleet=FleetSettings(2, "float32", "cuda"))),
-        (0, replace(TINY, checkpoints=(40, 50))),
+        (1, TINY, "seed 0, not 1"),
+        (0, replace(TINY, episodes=9), "config.episodes 4, not 9"),
+        (
+            0,
+            replace(TINY, sac=replace(TINY.sac, gamma=0.5)),
+            "config.sac.gamma 0.97, not 0.5",
+        ),
+        (
+            0,
+            replace(TINY, fleet=FleetSettings(2, "bfloat16")),
+            "config.fleet.precision 'float32', not 'bfloat16'",
+        ),
+        (0, replace(TINY, fleet=FleetSettings(9, "float32")), "config.fleet.size 2, not 9"),
+        (
+            0,
+            replace(TINY, fleet=FleetSettings(2, "float32", "cuda")),
+            "config.fleet.device 'cpu', not 'cuda'",
+        ),
+        (
+            0,
+            replace(TINY, checkpoints=(40, 50)),
+            "config.checkpoints [40, 60], not [40, 50]",
+        ),
     ],
 )
 @pytest.mark.parametrize("which", ["whole", "half"])
 def test_the_file_of_another_collection(
-    which: str, seed: int, rows: Budget, tmp_path: Path, request: pytest.FixtureRequest
+    which: str,
+    seed: int,
+    rows: Budget,
+    difference: str,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
 ) -> None:
     put(request.getfixturevalue(which), tmp_path)
     group = work(tmp_path, seed=seed, rows=rows)
     sentence = (
-        f"{group.path}: is of a collection with other options or package versions; give the same "
-        "options as then, or delete it to train its tasks again"
+        f"{group.path}: is of a collection with {difference}; give the same options as then, or "
+        "delete it to train its tasks again"
     )
     for use in (train_fleet, lambda group: trained_policies(group.jobs[0])):
         with pytest.raises(DatasetError) as caught:
@@ -223,7 +244,26 @@ def test_the_file_of_another_collection(
 def test_the_file_of_another_group(whole: Path, tmp_path: Path) -> None:
     group = work(tmp_path, tasks=(2, 5))
     shutil.copy(whole, group.path)
-    with pytest.raises(DatasetError, match="is of a collection with other options"):
+    with pytest.raises(DatasetError, match=r"of a collection with group \[2, 4\], not \[2, 5\]; "):
+        train_fleet(group)
+
+
+def test_the_file_of_other_versions(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = put(whole, tmp_path)
+    monkeypatch.setattr("datagen.job.versions", lambda: {"torch": "99.0"})
+    with pytest.raises(
+        DatasetError, match=r"with versions\.\w+ '[\d.]+', not nothing of that name"
+    ):
+        train_fleet(group)
+
+
+@pytest.mark.parametrize("about", [{}, {"origin": 3}])
+def test_a_file_that_does_not_say_what_it_is_of(about: dict[str, int], tmp_path: Path) -> None:
+    group = work(tmp_path)
+    save_state(group.path, {}, about)
+    with pytest.raises(DatasetError, match="with budget nothing of that name, not 'smoke'; "):
         train_fleet(group)
 
 
