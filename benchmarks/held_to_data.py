@@ -1,7 +1,7 @@
 r"""What holds a policy to the data: returns of oracle_task by its regulariser.
 
     python benchmarks/budget_curves.py --env half_cheetah_vel --work ~/budget_curves --steps 400000
-    python benchmarks/held_to_data.py --env half_cheetah_vel --data ~/budget_curves --work ~/runs
+    python benchmarks/held_to_data.py --env half_cheetah_vel --data ~/budget_curves/half_cheetah_vel_400000 --work ~/runs
 
 oracle_task is told the task, so what it lacks is the actor-critic's fault. Trains it once for each
 regulariser, on training tasks alone: `--validate` holds every fifth of them out. A run that is
@@ -51,7 +51,7 @@ class Benchmark:
     """Compare what holds a policy to the data."""
 
     data: Path
-    """Folder of the datasets, one below it for each environment."""
+    """Dataset of the environment."""
     work: Path
     """Folder for the runs, outside the repository."""
     env: str = "half_cheetah_vel"
@@ -113,7 +113,7 @@ def main() -> int:
     """Run the benchmark."""
     options = tyro.cli(Benchmark)
     common: list[Any] = ["--env", options.env, "--method", "oracle_task"]
-    common += ["--steps", options.steps, "--data", options.data / options.env, *SETTINGS]
+    common += ["--steps", options.steps, "--data", options.data, *SETTINGS]
     results = []
     for seed in options.seeds:
         for name, words in HELD.items():
@@ -121,7 +121,7 @@ def main() -> int:
             results.append(result(config, name, options.work))
             path = RESULTS / f"held_to_data_{config.env}.csv"
             write_results(path, results, {"torch": torch.__version__})
-    show(results, options.data / options.env)
+    show(results, options.data)
     return 0
 
 
