@@ -1,7 +1,8 @@
 r"""What holds a policy to the data: returns of oracle_task by its regulariser.
 
     python benchmarks/budget_curves.py --env half_cheetah_vel --work ~/budget_curves --steps 400000
-    python benchmarks/held_to_data.py --env half_cheetah_vel --data ~/budget_curves/half_cheetah_vel_400000 --work ~/runs
+    python benchmarks/held_to_data.py --env half_cheetah_vel --work ~/runs \
+        --data ~/budget_curves/half_cheetah_vel_400000
 
 oracle_task is told the task, so what it lacks is the actor-critic's fault. Trains it once for each
 regulariser, on training tasks alone: `--validate` holds every fifth of them out. A run that is
