@@ -31,8 +31,15 @@ KINDS = {
 """Kinds of metrics as the live table has them, by what the metrics' names begin with."""
 
 
-def run_command(command: Callable[[], None]) -> int:
+RESUMES = "Stopped. The same command goes on from the last checkpoint."
+
+
+def run_command(command: Callable[[], None], stopped: str = RESUMES) -> int:
     """Run a command; a user's mistake, or a disk's refusal, becomes one sentence on stderr.
+
+    Args:
+        command: what to run.
+        stopped: what Ctrl-C makes it say.
 
     Returns:
         The exit code: 0, 1 for a run that diverged, 2 for a mistake or a refusal, 130 for Ctrl-C.
@@ -40,7 +47,7 @@ def run_command(command: Callable[[], None]) -> int:
     try:
         command()
     except KeyboardInterrupt:
-        sys.stderr.write("Stopped. The same command goes on from the last checkpoint.\n")
+        sys.stderr.write(f"{stopped}\n")
         return 130
     except MISTAKES as error:
         sys.stderr.write(f"error: {error}\n")

@@ -61,7 +61,9 @@ def evaluate_agent(
     import torch
 
     from ctmrl.meta_test import MetaTest
-    from meta_envs import normalized_score, reference_returns
+    from ctmrl.report import score
+    from ctmrl.returns import share_of_cores
+    from meta_envs import reference_returns
 
     references = reference_returns(tasks)
     record: dict[str, Any] = {
@@ -80,7 +82,8 @@ def evaluate_agent(
     }
     if agent.method.note:
         record["note"] = agent.method.note
-    test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed)
+    threads = share_of_cores(config)
+    test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed, threads)
     results = test.run(groups)
     for name, rows in groups.items():
         result = results[name]
@@ -88,7 +91,6 @@ def evaluate_agent(
         if best_behavior and all(int(row) in best_behavior for row in rows):
             best = [best_behavior[int(row)] for row in rows]
             anchors["best_behavior"] = sum(best) / len(best)
-        expert = anchors.get("oracle", anchors.get("best_behavior"))
         value = float(result.returns.mean())
         contexts = torch.from_numpy(result.contexts.mean(axis=0))
         codes = agent.method.code_of(contexts)
@@ -96,9 +98,7 @@ def evaluate_agent(
             "tasks": rows.tolist(),
             "params": tasks.params[rows].tolist(),
             "return": value,
-            "score": None
-            if expert is None
-            else float(normalized_score(value, anchors["random"], expert)),
+            "score": score(value, anchors),
             "task_returns": result.returns.mean(axis=0).tolist(),
             "repetition_returns": result.returns.mean(axis=1).tolist(),
             "curve": result.curve.tolist(),
@@ -107,6 +107,16 @@ def evaluate_agent(
             "codes": None if codes is None else codes.tolist(),
         }
     return record
+
+
+def _check_out(config: EvaluateConfig) -> None:
+    """Refuse an output folder that holds a run, whose evaluation would be written over."""
+    from ctmrl import runs
+    from ctmrl.errors import UsageError
+
+    if config.out is not None and (config.out / runs.CONFIG).exists():
+        whose = "the run itself" if config.out.resolve() == config.run.resolve() else "another run"
+        raise UsageError(f"--out {config.out} is {whose}: choose another folder")
 
 
 def main(config: EvaluateConfig) -> None:
@@ -133,8 +143,7 @@ def main(config: EvaluateConfig) -> None:
         protocol = dataclasses.replace(run_config.meta_test, repetitions=config.repetitions)
         run_config = dataclasses.replace(run_config, meta_test=protocol)
     seed = run_config.seed if config.seed is None else config.seed
-    if config.out is not None and config.out.resolve() == config.run.resolve():
-        raise UsageError(f"--out {config.out} is the run itself: choose another folder")
+    _check_out(config)
     if config.fresh < 0:
         raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
     with runs.fitting(config.run / runs.CONFIG):
@@ -171,4 +180,4 @@ def main(config: EvaluateConfig) -> None:
 if __name__ == "__main__":
     from ctmrl.console import run_command
 
-    sys.exit(run_command(lambda: main(tyro.cli(EvaluateConfig))))
+    sys.exit(run_command(lambda: main(tyro.cli(EvaluateConfig)), stopped="Stopped."))

@@ -2,7 +2,8 @@
 
 Parameters, optimisers, losses and all that is not a layer of a network are float32 always. The
 layers of a network are in bfloat16, matrix products and what lies between them, where they are
-called inside `products_in("bfloat16")`: a network takes float32 and gives float32.
+called inside `products_in("bfloat16")`: a network takes float32 and gives float32. The last layer
+of critics is float32 always.
 """
 
 from __future__ import annotations

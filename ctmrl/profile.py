@@ -323,4 +323,4 @@ def main() -> None:
 if __name__ == "__main__":
     from ctmrl.console import run_command
 
-    sys.exit(run_command(main))
+    sys.exit(run_command(main, stopped="Stopped."))

@@ -53,11 +53,17 @@ def ordered_groups(record: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def score(value: float, references: dict[str, float]) -> float | None:
-    """Normalised score of a mean return: 0 is random, 100 the optimum or the best policy known."""
+    """Normalised score of a mean return: 0 is random, 100 the optimum or the best policy known.
+
+    Returns:
+        None where neither is known, or where it is not above random.
+    """
+    from meta_envs import normalized_score
+
     expert = references.get("oracle", references.get("best_behavior"))
-    if expert is None:
+    if expert is None or expert <= references["random"]:
         return None
-    return 100.0 * (value - references["random"]) / (expert - references["random"])
+    return float(normalized_score(value, references["random"], expert))
 
 
 def result_table(record: dict[str, Any]) -> Table:
@@ -153,10 +159,8 @@ def context_figure(record: dict[str, Any]) -> Figure:
     has_codes = all(group["codes"] is not None for group in groups.values())
     figure = Figure(figsize=(11 if has_codes else 5.6, 4.8), layout="constrained")
     all_axes = figure.subplots(1, 2 if has_codes else 1, squeeze=False)[0]
-    angle = (
-        np.degrees(np.arctan2(params[:, 1], params[:, 0])) if params.shape[1] > 1 else params[:, 0]
-    )
-    panels = [(angle, "twilight" if np.ptp(angle) > 200 else "viridis", _parameter(record))]
+    value, title = _parameter(record["param_names"], params)
+    panels = [(value, "twilight" if np.ptp(value) > 200 else "viridis", title)]
     if has_codes:
         codes = np.concatenate([np.array(group["codes"]) for group in groups.values()])
         panels.append((codes, "tab20", f"code ({len(np.unique(codes))} in use)"))
@@ -185,9 +189,15 @@ def context_figure(record: dict[str, Any]) -> Figure:
     return figure
 
 
-def _parameter(record: dict[str, Any]) -> str:
-    names = record["param_names"]
-    return f"angle of ({', '.join(names)}), degrees" if len(names) > 1 else str(names[0])
+def _parameter(names: list[str], params: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+    """A number that tells tasks apart, [n], of their parameters [n, P], and its name."""
+    if len(names) == 1:
+        return params[:, 0], names[0]
+    if len(names) == 2:
+        angle = np.degrees(np.arctan2(params[:, 1], params[:, 0]))
+        return angle, f"angle of ({', '.join(names)}), degrees"
+    points, share = plane(params)
+    return points[:, 0], f"main direction of {len(names)} parameters ({share[0]:.0%})"
 
 
 def plane(contexts: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -267,4 +277,4 @@ def main(config: ReportConfig) -> None:
 if __name__ == "__main__":
     from ctmrl.console import run_command
 
-    sys.exit(run_command(lambda: main(tyro.cli(ReportConfig))))
+    sys.exit(run_command(lambda: main(tyro.cli(ReportConfig)), stopped="Stopped."))

@@ -38,6 +38,11 @@ def measured_beside(config: RunConfig) -> bool:
     return config.beside == "always"
 
 
+def share_of_cores(config: RunConfig) -> int:
+    """Cores for a run that has nothing else to do, beside other seeds."""
+    return max(spare_cores(config) + config.threads, 1)
+
+
 def measure_of(config: RunConfig, learner: Learner) -> Measure:
     """What measures the mean return on the training tasks, one repetition, of the agent as it is.
 
@@ -51,7 +56,7 @@ def measure_of(config: RunConfig, learner: Learner) -> Measure:
         task_set(config.env),
         dataclasses.replace(config.meta_test, repetitions=1),
         config.seed,
-        max(spare_cores(config), 1) if beside else None,
+        max(spare_cores(config), 1) if beside else share_of_cores(config),
     )
     tasks = learner.data.tasks
 

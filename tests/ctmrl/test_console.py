@@ -52,6 +52,11 @@ def test_what_ends_a_command(
     assert capsys.readouterr() == ("", said)
 
 
+def test_ctrl_c_in_a_command_that_does_not_go_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(lambda: failing(KeyboardInterrupt()), stopped="Stopped.") == 130
+    assert capsys.readouterr() == ("", "Stopped.\n")
+
+
 def test_a_command_that_ends_well(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(lambda: None) == 0
     assert capsys.readouterr() == ("", "")

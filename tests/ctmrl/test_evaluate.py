@@ -248,4 +248,9 @@ def test_the_runs_own_folder_as_output(copy: Path, capsys: pytest.CaptureFixture
     out = copy / ".." / copy.name
     said = f"--out {out} is the run itself: choose another folder"
     assert mistake(capsys, copy, out=out, fresh=1) == said
+    other = copy.with_name("other")
+    shutil.copytree(copy, other)
+    said = f"--out {other} is another run: choose another folder"
+    assert mistake(capsys, copy, out=other, fresh=1) == said
+    assert contents(other) == before
     assert contents(copy) == before

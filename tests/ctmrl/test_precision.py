@@ -118,12 +118,25 @@ def test_a_network_computes_in_bfloat16_and_gives_what_it_is_given() -> None:
     with pytest.raises(KeyError), products_in("bfloat16"):
         raise KeyError
     assert net(x).equal(plain[0])
+    # A result of bfloat16 has 8 bits, and its float32 no more; a critic's last layer is float32.
+    assert low[0].equal(low[0].to(LOW).float())
+    assert not low[1].equal(low[1].to(LOW).float())
     for found, wanted in zip(low, plain, strict=True):
         assert found.dtype == torch.float32
         assert not found.equal(wanted)
-        # A result of bfloat16 has 8 bits, and its float32 no more.
-        assert found.equal(found.to(LOW).float())
         torch.testing.assert_close(found, wanted, rtol=0.03, atol=0.03)
+
+
+def test_a_critic_far_from_zero_tells_actions_apart() -> None:
+    x, z = normal(64, OBS).float(), normal(64, Z, seed=1).float()
+    critic = Critic(statistics().obs, Z, (32, 32), heads=2)
+    near = critic(x, z)
+    critic.shift(-150.0)
+    with products_in("bfloat16"):
+        far = critic(x, z) + 150.0
+    assert near.std() > 0.05
+    # In bfloat16 the steps between numbers are 1 there.
+    torch.testing.assert_close(far, near, rtol=0, atol=0.02)
 
 
 def test_layers_that_are_shared_and_frozen_ones() -> None:
@@ -166,7 +179,9 @@ def test_a_weight_is_cast_once_for_a_call_and_critics_calls_share(
     found = {name: watch.cast[place] for place, name in places.items()}
     for name, times in found.items():
         wanted = 1
-        if "dual_critic" in name:
+        if name.endswith((".weights.3", ".biases.3")):
+            wanted = 0  # a critic's last layer
+        elif "dual_critic" in name:
             wanted = 2  # before its step and after
         elif "codebook" in name:
             wanted = 0

@@ -55,6 +55,9 @@ def test_the_score() -> None:
     # Where the optimum is not known, the best behaviour policy is the expert.
     assert score(-20.0, {"random": -30.0, "best_behavior": -10.0}) == 50.0
     assert score(-20.0, {"random": -30.0}) is None
+    # A dataset's best policies may be no better than random ones.
+    assert score(-20.0, {"random": -30.0, "best_behavior": -30.0}) is None
+    assert score(-20.0, {"random": -30.0, "best_behavior": -40.0}) is None
 
 
 def test_groups_are_shown_unseen_first() -> None:
@@ -161,6 +164,19 @@ def test_the_context_figure_with_and_without_codes(method: str, panels: int) -> 
     if method == "ctmrl":
         codes = {code for group in shown["groups"].values() for code in group["codes"]}
         assert drawn[1].get_title() == f"coloured by code ({len(codes)} in use)"
+
+
+def test_tasks_of_many_parameters_are_coloured_by_their_main_direction() -> None:
+    shown = record(groups=("fresh",))
+    group, generator = shown["groups"]["fresh"], np.random.default_rng(0)
+    line = np.linspace(-1.0, 1.0, len(group["tasks"]))
+    noise = generator.normal(scale=0.01, size=(len(line), 41))
+    shown["param_names"] = [f"a_rather_long_name_{index}" for index in range(41)]
+    group["params"] = (line[:, None] * np.linspace(0.1, 1.0, 41) + noise).tolist()
+    drawn = context_figure(shown).axes[0]
+    assert drawn.get_title() == "coloured by main direction of 41 parameters (100%)"
+    colors = np.asarray(drawn.collections[0].get_array())
+    assert np.corrcoef(colors, line)[0, 1] > 0.99
 
 
 @pytest.mark.parametrize("change", ["fresh", "one parameter", "one task", "no adaptation"])
