@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from ctmrl.errors import UsageError
 
 RESAMPLES = 10_000
+APART = ("seed", "threads")
+"""Settings in which the runs of one mean may differ."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ def find_records(paths: list[Path]) -> list[dict[str, Any]]:
         try:
             record = json.loads(file.read_bytes())
             record["run"] = str(file.parent)
+            record["settings"] = _settings(file.with_name("config.json"))
             _check(record)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UsageError(
@@ -75,6 +78,18 @@ def find_records(paths: list[Path]) -> list[dict[str, Any]]:
             ) from None
         records.append(record)
     return records
+
+
+def _settings(file: Path) -> dict[str, Any]:
+    """What a run's result depends on beside its seed, by name; empty without a run's config."""
+    if not file.exists():
+        return {}
+    config = json.loads(file.read_bytes())
+    settings = {"dataset": config["dataset"], **config["settings"]}
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= value if isinstance(value, dict) else {name: value}
+    return {name: value for name, value in flat.items() if name not in APART}
 
 
 def _check(record: dict[str, Any]) -> None:
@@ -90,7 +105,7 @@ def collate(records: list[dict[str, Any]]) -> list[Result]:
     """Group records by environment, method and group of tasks.
 
     Raises:
-        UsageError: two runs of one seed, or runs scored on different tasks.
+        UsageError: two runs of one seed, of other settings, or scored on different tasks.
     """
     rows: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for record in records:
@@ -100,16 +115,7 @@ def collate(records: list[dict[str, Any]]) -> list[Result]:
     for (env, method, group), members in rows.items():
         members.sort(key=lambda record: int(record["seed"]))
         for one, other in pairwise(members):
-            if one["seed"] == other["seed"]:
-                raise UsageError(
-                    f"{one['run']} and {other['run']} both have seed {one['seed']} of {method} on "
-                    f"{env}: name the folders of one setting only"
-                )
-            if one["groups"][group]["tasks"] != other["groups"][group]["tasks"]:
-                raise UsageError(
-                    f"{one['run']} and {other['run']} were scored on different {group} tasks: "
-                    "report them apart"
-                )
+            _check_fit(one, other, group)
         groups = [member["groups"][group] for member in members]
         results.append(
             Result(
@@ -124,6 +130,25 @@ def collate(records: list[dict[str, Any]]) -> list[Result]:
             )
         )
     return results
+
+
+def _check_fit(one: dict[str, Any], other: dict[str, Any], group: str) -> None:
+    """Raise a UsageError unless two runs may stand in one mean."""
+    both = f"{one['run']} and {other['run']}"
+    if one["seed"] == other["seed"]:
+        raise UsageError(
+            f"{both} both have seed {one['seed']} of {one['method']} on {one['env']}: "
+            "name the folders of one setting only"
+        )
+    for name in ("tasks", "params"):
+        if one["groups"][group].get(name) != other["groups"][group].get(name):
+            raise UsageError(f"{both} were scored on different {group} tasks: report them apart")
+    ours, theirs = (run.get("settings", {}) | run.get("protocol", {}) for run in (one, other))
+    for name in sorted(ours.keys() & theirs.keys()):
+        if ours[name] != theirs[name]:
+            raise UsageError(
+                f"{both} differ in {name} ({ours[name]} and {theirs[name]}): report them apart"
+            )
 
 
 def interval(values: NDArray[np.float64], seed: int = 0) -> tuple[float, float]:

@@ -230,7 +230,7 @@ def record(
         "groups": {
             name: {
                 "tasks": [10 * number + k for k in range(5)],
-                "params": draw.uniform(-0.05, 0.05, (5, 2)).tolist(),
+                "params": np.random.default_rng(number).uniform(-0.05, 0.05, (5, 2)).tolist(),
                 "return": -8.0 - seed - number,
                 "score": 100.0 * (22.0 - seed - number) / 25.0,
                 "task_returns": [-8.0 - seed - number] * 5,

@@ -120,6 +120,32 @@ def test_runs_on_different_tasks_are_one_sentence() -> None:
         collate([of_run("a"), other])
 
 
+def test_fresh_tasks_of_other_seeds_are_different_tasks() -> None:
+    one, other = of_run("a"), of_run("b", seed=1)
+    other["groups"]["unseen"]["params"][0][0] += 0.01
+    with pytest.raises(UsageError, match=r"^a and b were scored on different unseen tasks"):
+        collate([one, other])
+
+
+def test_runs_of_other_settings_are_one_sentence(tmp_path: Path) -> None:
+    for seed, steps in ((0, 60), (1, 60), (2, 70)):
+        folder = tmp_path / f"seed-{seed}"
+        folder.mkdir()
+        (folder / "evaluation.json").write_text(json.dumps(of_run(seed=seed)))
+        settings = {"seed": seed, "threads": seed + 1, "training": {"steps": steps}}
+        config = {"dataset": "abc", "settings": settings}
+        (folder / "config.json").write_text(json.dumps(config))
+    assert collate(find_records([tmp_path / "seed-0", tmp_path / "seed-1"]))
+    said = r"/seed-1 and .*/seed-2 differ in steps \(60 and 70\): report them apart$"
+    with pytest.raises(UsageError, match=said):
+        collate(find_records([tmp_path]))
+    # An evaluation in a folder of its own says how many episodes it had.
+    one, other = of_run("a"), of_run("b", seed=1)
+    other["protocol"]["repetitions"] = 1
+    with pytest.raises(UsageError, match=r"^a and b differ in repetitions \(3 and 1\)"):
+        collate([one, other])
+
+
 def test_the_interval_is_of_the_mean() -> None:
     values = np.random.default_rng(0).normal(-6.0, 0.5, 29)
     low, high = interval(values)
