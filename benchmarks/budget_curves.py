@@ -97,17 +97,17 @@ class Curves:
 
 
 def long_budget(env: str, steps: int | None) -> Budget:
-    """The standard budget for other steps.
+    """The standard budget for other steps, random in a quarter of them as in the paper's budget.
 
     Raises:
         ValueError: steps that are no multiple of the checkpoints' and the updates' distances.
     """
-    row = budget(env, "standard")
+    row, field = budget(env, "standard"), budget(env, "paper")
     steps = TIMES * row.steps if steps is None else steps
     unit = CHECKPOINTS * row.sac.update_every
     if steps < unit or steps % unit:
         raise ValueError(f"--steps must be a multiple of {unit}, got {steps}")
-    random = row.random_steps * steps // (TIMES * row.steps)
+    random = field.random_steps * steps // (TIMES * field.steps)
     marks = (steps * part // CHECKPOINTS for part in range(1, CHECKPOINTS + 1))
     learnt = tuple(mark for mark in marks if mark > random)
     return replace(row, name="curves", steps=steps, random_steps=random, checkpoints=learnt)
