@@ -135,6 +135,9 @@ SMOKE: Settings = {
 }
 """What every environment's smoke preset has on top of its standard one."""
 
+OF_METHODS: dict[str, Settings] = {"ctmrl_released": {"divergence_wind_up": True}}
+"""What a method has in every preset of every environment on top of those."""
+
 ROWS: dict[str, Row] = {
     "point_robot": Row(8, PAPER_GOAL, GOAL),
     "point_robot_wind": Row(8, PAPER_WIND, {}),
@@ -182,6 +185,7 @@ def preset(env: str, method: str, name: Preset, **changes: Any) -> RunConfig:
         raise UsageError(f"no preset for '{env}' (there are: {', '.join(ROWS)})")
     codes, paper, standard = ROWS[env]
     chosen = {"paper": paper, "standard": standard, "smoke": standard | SMOKE}[name]
+    chosen = chosen | OF_METHODS.get(method, {})
     chosen = chosen | {"codes": min(codes, chosen.get("codes", codes))}
     return RunConfig(
         _with(MetaTrainConfig, chosen),

@@ -17,7 +17,7 @@ from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
 from ctmrl.methods.base import Dimensions
 from ctmrl.methods.ctmrl import CTMRLConfig
-from ctmrl.presets import ROWS, SMOKE, config_from_settings, known_preset, preset
+from ctmrl.presets import OF_METHODS, ROWS, SMOKE, config_from_settings, known_preset, preset
 from ctmrl.runs import to_json
 from datagen.budgets import budget
 from meta_envs import ENVIRONMENTS, task_set
@@ -115,6 +115,14 @@ def test_the_data_of_the_same_budget_are_enough(config: RunConfig) -> None:
     assert METHODS[config.method].method.context_sets * config.training.context_episodes <= episodes
 
 
+def test_the_multiplier_winds_up_in_the_released_reading_and_where_the_field_is_meant(
+    config: RunConfig,
+) -> None:
+    robots_of_the_field = config.preset == "paper" and config.env not in POINT_ROBOTS
+    wanted = config.method == "ctmrl_released" or robots_of_the_field
+    assert config.actor_critic.divergence_wind_up is wanted
+
+
 def test_every_environment_has_presets() -> None:
     assert list(ROWS) == list(ENVIRONMENTS)
 
@@ -124,8 +132,9 @@ def test_every_setting_of_a_row_is_an_option_of_some_method() -> None:
     parts += [row.config for row in METHODS.values()]
     known = {field.name for part in parts for field in dataclasses.fields(part)} | {"precision"}
     for row in ROWS.values():
-        for settings in (row.paper, row.standard, SMOKE):
+        for settings in (row.paper, row.standard, SMOKE, *OF_METHODS.values()):
             assert settings.keys() <= known
+    assert OF_METHODS.keys() <= METHODS.keys()
 
 
 def test_changes_are_made() -> None:
