@@ -46,15 +46,19 @@ def share_of_cores(config: RunConfig) -> int:
 def measure_of(config: RunConfig, learner: Learner) -> Measure:
     """What measures the mean return on the training tasks, one repetition, of the agent as it is.
 
-    Beside training that is a copy of the agent, on the cores that are spare.
+    Beside training that is a copy of the agent, on the cores that are spare. An agent that
+    exploration cannot change is measured without it.
     """
+    protocol = dataclasses.replace(config.meta_test, repetitions=1)
+    if not learner.method.explores:
+        protocol = dataclasses.replace(protocol, random_episodes=0, policy_episodes=0)
     beside = measured_beside(config)
     agent = copy.deepcopy(learner.agent) if beside else learner.agent
     test = MetaTest(
         agent.method.encoder,
         agent.actor,
         task_set(config.env),
-        dataclasses.replace(config.meta_test, repetitions=1),
+        protocol,
         config.seed,
         max(spare_cores(config), 1) if beside else share_of_cores(config),
     )

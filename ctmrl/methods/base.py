@@ -58,6 +58,8 @@ class Method(nn.Module, ABC):
     """Contexts from different episodes each step needs of a task."""
     note: ClassVar[str] = ""
     """What stands behind the method's name in every table, where a reader must know it."""
+    explores: ClassVar[bool] = True
+    """Whether exploration can change what the policy is told."""
 
     def __init__(self, config: MethodConfig, statistics: Statistics, dims: Dimensions) -> None:
         """Build the encoder; initial weights come from torch's global generator."""
@@ -113,6 +115,8 @@ class Method(nn.Module, ABC):
 
 class Reference(Method):
     """A line to read methods against: it learns no contexts, and `note` says so in every table."""
+
+    explores = False
 
     @abstractmethod
     def build_encoder(self, config: MethodConfig, statistics: Statistics) -> Encoder:

@@ -19,6 +19,7 @@ from ctmrl import returns
 from ctmrl.config import RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.errors import Diverged
+from ctmrl.meta_test import meta_test
 from ctmrl.meta_train import Learner
 from ctmrl.methods import METHODS
 from ctmrl.presets import preset
@@ -37,6 +38,7 @@ from ctmrl.seeds import plan
 from ctmrl.synthetic import synthetic_dataset
 from ctmrl.threads import settle_threads
 from ctmrl.train import train
+from meta_envs import task_set
 from tests.ctmrl.commands import FILES, Commands, contents, rows, wait_until
 from tests.ctmrl.conftest import FinishedRun
 from tests.ctmrl.examples import smoke
@@ -253,6 +255,22 @@ def check_value(config: RunConfig, data: OfflineData) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_is_measured_as_it_was(method: str, wind_data: OfflineData) -> None:
     check_value(preset("point_robot_wind", method, "smoke"), wind_data)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_exploration_cannot_change_is_measured_without_it(
+    method: str, wind_data: OfflineData
+) -> None:
+    config = preset("point_robot_wind", method, "smoke")
+    learner, steps = Learner(config, wind_data), []
+    learner.update()
+    found = measure_of(config, learner)(lambda: steps.append(1))
+    # Two random episodes and two of the policy, each with one beside it that is scored.
+    episodes = 1 if method in ("oracle_task", "no_context") else 2 * (2 + 2) + 1
+    assert len(steps) == 25 * episodes
+    agent, tasks = learner.agent, task_set(config.env)
+    whole = (agent.method.encoder, agent.actor, tasks, wind_data.tasks, config.meta_test)
+    assert found == meta_test(*whole, config.seed).returns.mean()
 
 
 def test_a_mujoco_robot_is_measured_as_it_was() -> None:
