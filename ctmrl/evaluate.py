@@ -62,10 +62,11 @@ def evaluate_agent(
 
     from ctmrl.meta_test import MetaTest
     from ctmrl.report import score
-    from ctmrl.returns import share_of_cores
+    from ctmrl.seeds import own_cores
     from meta_envs import reference_returns
 
-    references = reference_returns(tasks)
+    threads = own_cores(config)
+    references = reference_returns(tasks, threads=threads)
     record: dict[str, Any] = {
         "env": config.env,
         "method": config.label,
@@ -82,7 +83,6 @@ def evaluate_agent(
     }
     if agent.method.note:
         record["note"] = agent.method.note
-    threads = share_of_cores(config)
     test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed, threads)
     results = test.run(groups)
     for name, rows in groups.items():

@@ -15,7 +15,7 @@ from ctmrl.config import RunConfig
 from ctmrl.errors import Diverged
 from ctmrl.meta_test import MetaTest
 from ctmrl.meta_train import Learner
-from ctmrl.seeds import cores
+from ctmrl.seeds import own_cores
 from ctmrl.threads import settle_threads
 from meta_envs import task_set
 
@@ -28,7 +28,7 @@ RETURN = "return/training_tasks"
 
 def spare_cores(config: RunConfig) -> int:
     """Cores left by a run's threads and by the seeds beside it; below 1 if there are none."""
-    return cores() // (config.workers or 1) - config.threads
+    return own_cores(config) - config.threads
 
 
 def measured_beside(config: RunConfig) -> bool:
@@ -36,11 +36,6 @@ def measured_beside(config: RunConfig) -> bool:
     if config.beside == "auto":
         return spare_cores(config) > 0
     return config.beside == "always"
-
-
-def share_of_cores(config: RunConfig) -> int:
-    """Cores for a run that has nothing else to do, beside other seeds."""
-    return max(spare_cores(config) + config.threads, 1)
 
 
 def measure_of(config: RunConfig, learner: Learner) -> Measure:
@@ -60,7 +55,7 @@ def measure_of(config: RunConfig, learner: Learner) -> Measure:
         task_set(config.env),
         protocol,
         config.seed,
-        max(spare_cores(config), 1) if beside else share_of_cores(config),
+        max(spare_cores(config), 1) if beside else own_cores(config),
     )
     tasks = learner.data.tasks
 

@@ -95,6 +95,11 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+def own_cores(config: RunConfig) -> int:
+    """A run's share of the cores, beside the seeds that are trained with it; at least 1."""
+    return max(cores() // (config.workers or 1), 1)
+
+
 def train_seeds(train: Train, config: RunConfig, folder: Path, console: Console) -> int:
     """Train a run of each seed, show how they get on, and print the report of the finished ones.
 

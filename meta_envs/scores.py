@@ -27,7 +27,7 @@ def _episode_returns(env: MetaVectorEnv, controller: Controller) -> Floats:
 
 
 def reference_returns(
-    tasks: TaskSet, episodes: int | None = None, seed: int = 0
+    tasks: TaskSet, episodes: int | None = None, seed: int = 0, threads: int | None = None
 ) -> dict[str, Floats]:
     """Undiscounted returns of the reference controllers on exactly these tasks.
 
@@ -35,6 +35,8 @@ def reference_returns(
         tasks: any task set, the environment's own, a part of it or fresh tasks.
         episodes: episodes a task of the random policy; the environment's own number by default.
         seed: of the random policy's private generator.
+        threads: that step the environments; as many as there are by default. No number depends on
+            them.
 
     Returns:
         `random` (uniform actions, mean of `episodes`) and one entry for each controller of the
@@ -49,11 +51,12 @@ def reference_returns(
 
     if episodes is None:
         episodes = definition(tasks.env).random_episodes
-    many = MetaVectorEnv(tasks.env, tasks=np.repeat(rows, episodes), task_set=tasks)
+    repeated = np.repeat(rows, episodes)
+    many = MetaVectorEnv(tasks.env, tasks=repeated, task_set=tasks, threads=threads)
     shape = (many.num_envs, *many.definition.action_space.shape)
     found = {"random": _episode_returns(many, uniform).reshape(len(tasks), episodes).mean(axis=1)}
     for name, controller in many.definition.controllers.items():
-        one = MetaVectorEnv(tasks.env, tasks=rows, task_set=tasks)
+        one = MetaVectorEnv(tasks.env, tasks=rows, task_set=tasks, threads=threads)
         found[name] = _episode_returns(one, controller)
     return found
 

@@ -19,7 +19,7 @@ from ctmrl.evaluate import EvaluateConfig, evaluate_agent, main
 from ctmrl.meta_test import meta_test
 from ctmrl.methods.base import Dimensions
 from ctmrl.presets import config_from_settings
-from ctmrl.runs import load_checkpoint, read_json
+from ctmrl.runs import load_checkpoint, read_json, to_json
 from meta_envs import reference_returns, task_set
 from tests.ctmrl.commands import Commands, contents
 from tests.ctmrl.conftest import FinishedRun
@@ -131,6 +131,21 @@ def test_another_seed_explores_otherwise(finished_run: FinishedRun, agent: Agent
     records = [evaluate_agent(agent, config, tasks, groups, {}, seed) for seed in (0, 0, 1)]
     assert records[0] == records[1]
     assert records[0]["groups"]["fresh"]["contexts"] != records[2]["groups"]["fresh"]["contexts"]
+
+
+def test_behaviour_no_better_than_random_is_no_scale(
+    agent: Agent, finished_run: FinishedRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A robot whose optimum is not known, and a policy of too few steps to be worth anything.
+    random = {"random": np.full(50, 20.0)}
+    monkeypatch.setattr("meta_envs.reference_returns", lambda tasks, threads: random)
+    config = config_from_settings(read_json(finished_run.path / "config.json"), Path())
+    groups = {"unseen": np.array([2, 7]), "seen": np.array([0, 1])}
+    best = {2: 19.0, 7: 21.0, 0: 20.0, 1: 30.0}
+    record = evaluate_agent(agent, config, task_set("point_robot_wind"), groups, best, 0)
+    assert record["groups"]["unseen"]["score"] is None
+    assert record["groups"]["seen"]["score"] < 0
+    assert json.loads(to_json(record)) == record
 
 
 def mistake(capsys: pytest.CaptureFixture[str], run: Path, **options: Any) -> str:

@@ -15,7 +15,6 @@ import pytest
 import torch
 from rich.console import Console
 
-from ctmrl import returns
 from ctmrl.config import RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.errors import Diverged
@@ -38,7 +37,7 @@ from ctmrl.seeds import plan
 from ctmrl.synthetic import synthetic_dataset
 from ctmrl.threads import settle_threads
 from ctmrl.train import train
-from meta_envs import task_set
+from meta_envs import MetaVectorEnv, task_set
 from tests.ctmrl.commands import FILES, Commands, contents, rows, wait_until
 from tests.ctmrl.conftest import FinishedRun
 from tests.ctmrl.examples import smoke
@@ -213,7 +212,6 @@ def test_a_measurement_computes_as_a_run_does() -> None:
 
 def test_which_runs_have_a_free_core(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def spare(cores: int, **changes: Any) -> int:
-        monkeypatch.setattr(returns, "cores", lambda: cores)
         monkeypatch.setattr("ctmrl.seeds.cores", lambda: cores)
         config = dataclasses.replace(smoke(), **changes)
         if config.seeds:
@@ -229,6 +227,34 @@ def test_which_runs_have_a_free_core(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert spare(4, seeds=(0, 1, 2, 3, 4)) == 0
     assert spare(4, seeds=(0, 1, 2, 3, 4), workers=2) == 1
     assert spare(8, seeds=(0, 1), threads=3) == 1
+
+
+@pytest.mark.parametrize(
+    ("beside", "workers", "wanted"),
+    # The 16 cores are shared by the seeds, and beside training it keeps its own.
+    [("never", 5, {3}), ("always", 5, {2, 3}), ("never", None, {16}), ("never", 40, {1})],
+)
+def test_seeds_share_the_cores_that_step_their_environments(
+    beside: Any,
+    workers: int | None,
+    wanted: set[int],
+    wind_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found: list[int | None] = []
+
+    def spied(*arguments: Any, **options: Any) -> MetaVectorEnv:
+        found.append(options["threads"])
+        return MetaVectorEnv(*arguments, **options)
+
+    monkeypatch.setattr("ctmrl.seeds.cores", lambda: 16)
+    for module in ("ctmrl.meta_test", "meta_envs.scores"):
+        monkeypatch.setattr(f"{module}.MetaVectorEnv", spied)
+    run(smoke(2, data=wind_path), out=tmp_path / "run", beside=beside, workers=workers)
+    # A return on training tasks, the evaluation, and the references of the wind.
+    assert len(found) == 2 + 3
+    assert set(found) == wanted
 
 
 def run(config: RunConfig, **changes: Any) -> None:
