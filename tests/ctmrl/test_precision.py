@@ -8,7 +8,7 @@ import re
 import signal
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -137,6 +137,20 @@ def test_a_critic_far_from_zero_tells_actions_apart() -> None:
     assert near.std() > 0.05
     # In bfloat16 the steps between numbers are 1 there.
     torch.testing.assert_close(far, near, rtol=0, atol=0.02)
+
+
+def test_gradients_of_a_critic_far_from_zero_are_near_those_of_float32() -> None:
+    x, z = normal(64, OBS).float(), normal(64, Z, seed=1).float()
+    critic = Critic(statistics().obs, Z, (32, 32), heads=2)
+    critic.shift(-150.0)
+    target = critic(x, z).detach() + 0.1 * normal(2, 64, seed=2).float()
+    found: dict[Precision, Tensor] = {}
+    for precision in get_args(Precision):
+        with products_in(precision):
+            loss = (critic(x, z) - target).square().mean()
+        gradients = torch.autograd.grad(loss, [*critic.parameters()])
+        found[precision] = torch.cat([one.flatten() for one in gradients])
+    assert (found["bfloat16"] - found["float32"]).norm() < 0.1 * found["float32"].norm()
 
 
 def test_layers_that_are_shared_and_frozen_ones() -> None:
