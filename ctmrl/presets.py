@@ -11,7 +11,7 @@ from ctmrl.config import MetaTrainConfig, Preset, RunConfig
 from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
-from ctmrl.runs import with_later_settings
+from ctmrl.settings import with_later_settings
 
 Settings = dict[str, Any]
 """Options by name, where they are not the defaults of their dataclasses."""

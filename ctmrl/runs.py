@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ctmrl.errors import UsageError
+from ctmrl.settings import LATER_SETTINGS, with_later_settings
 from datagen.dataset import write_whole
 
 CONFIG, METRICS, CHECKPOINT, EVALUATION, LOGGERS = (
@@ -39,16 +40,6 @@ RUN_FILES = (
     CONFIG,
 )
 """All that a run's folder holds, in an order in which any beginning may be missing."""
-
-LATER_SETTINGS: dict[str, Any] = {
-    "quality": "mixed",
-    "data_episodes": None,
-    "precision": "float32",
-    "device": "cpu",
-    "actor_critic": {"behavior_cloning": 0.0, "cloning_advantage": 0.0, "value_from_data": False},
-}
-"""Settings that came after the first runs, and what a run has that does not name them. Where they
-are this, config.json leaves them out: such a run is the same in every version, byte for byte."""
 
 
 class RunError(UsageError):
@@ -123,24 +114,6 @@ def begun_with(path: Path, name: str) -> Any:
     config = path / CONFIG
     settings = read_json(config).get("settings") if config.exists() else None
     return with_later_settings(settings).get(name) if isinstance(settings, dict) else None
-
-
-def with_later_settings(
-    settings: dict[str, Any], later: dict[str, Any] = LATER_SETTINGS
-) -> dict[str, Any]:
-    """A run's settings, with those it does not name because they came later."""
-    found = {**later, **settings}
-    nested = [key for key, value in later.items() if isinstance(value, dict)]
-    return found | {key: with_later_settings(found[key], later[key]) for key in nested}
-
-
-def without_later_settings(
-    settings: dict[str, Any], later: dict[str, Any] = LATER_SETTINGS
-) -> dict[str, Any]:
-    """A run's settings, without those that came later and are as they were before."""
-    found = {k: v for k, v in settings.items() if k not in later or v != later[k]}
-    nested = [key for key, value in later.items() if isinstance(value, dict) and key in found]
-    return found | {key: without_later_settings(found[key], later[key]) for key in nested}
 
 
 class RunFolder:

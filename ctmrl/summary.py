@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmrl.errors import UsageError
+from ctmrl.settings import with_later_settings
 
 RESAMPLES = 10_000
-APART = ("seed", "threads")
+APART = ("seed", "threads", "device")
 """Settings in which the runs of one mean may differ."""
 
 
@@ -85,7 +86,7 @@ def _settings(file: Path) -> dict[str, Any]:
     if not file.exists():
         return {}
     config = json.loads(file.read_bytes())
-    settings = {"dataset": config["dataset"], **config["settings"]}
+    settings = {"dataset": config["dataset"], **with_later_settings(config["settings"])}
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         flat |= value if isinstance(value, dict) else {name: value}
@@ -114,7 +115,8 @@ def collate(records: list[dict[str, Any]]) -> list[Result]:
     results = []
     for (env, method, group), members in rows.items():
         members.sort(key=lambda record: int(record["seed"]))
-        for one, other in pairwise(members):
+        # All pairs: a run without a config.json fits those beside it whatever they are.
+        for one, other in combinations(members, 2):
             _check_fit(one, other, group)
         groups = [member["groups"][group] for member in members]
         results.append(

@@ -72,7 +72,7 @@ def settings_of(
     config: RunConfig, dataset: Dataset, split: Split, learner: Learner
 ) -> dict[str, Any]:
     """What config.json holds: all that decides the run's results."""
-    from ctmrl.runs import without_later_settings
+    from ctmrl.settings import without_later_settings
 
     # Of a device such as cuda:1, what decides the bytes.
     every = {**dataclasses.asdict(config), "device": learner.device.type}.items()

@@ -16,13 +16,7 @@ import pytest
 import torch
 
 from ctmrl import runs
-from ctmrl.runs import (
-    LATER_SETTINGS,
-    RunError,
-    RunFolder,
-    with_later_settings,
-    without_later_settings,
-)
+from ctmrl.runs import RunError, RunFolder
 from tests.ctmrl.commands import Commands, contents
 
 SETTINGS: dict[str, Any] = {
@@ -116,19 +110,6 @@ def test_settings_that_came_later_are_known_of_earlier_runs(path: Path) -> None:
         pass
     with pytest.raises(RunError, match=r"settings.data_episodes = 3, this one has None: "):
         RunFolder(path, SETTINGS, restart=False)
-
-
-def test_settings_that_came_later_are_left_out_where_they_change_nothing() -> None:
-    inner = LATER_SETTINGS["actor_critic"] | {"gamma": 0.5, "value_from_data": True}
-    settings = {"seed": 3, "quality": "mixed", "data_episodes": 3, "actor_critic": inner}
-    kept = {
-        "seed": 3,
-        "data_episodes": 3,
-        "actor_critic": {"gamma": 0.5, "value_from_data": True},
-    }
-    assert without_later_settings(settings) == kept
-    assert with_later_settings(kept) == LATER_SETTINGS | settings
-    assert with_later_settings({})["actor_critic"] == LATER_SETTINGS["actor_critic"]
 
 
 def test_a_refused_folder_is_not_kept_locked(path: Path) -> None:

@@ -127,16 +127,18 @@ def test_fresh_tasks_of_other_seeds_are_different_tasks() -> None:
         collate([one, other])
 
 
+def write_run(folder: Path, seed: int, settings: dict[str, Any] | None) -> None:
+    write(folder / f"seed-{seed}", record(seed=seed))
+    if settings is not None:
+        config = {"dataset": "abc", "settings": {"seed": seed, **settings}}
+        (folder / f"seed-{seed}" / "config.json").write_text(json.dumps(config))
+
+
 def test_runs_of_other_settings_are_one_sentence(tmp_path: Path) -> None:
     for seed, steps in ((0, 60), (1, 60), (2, 70)):
-        folder = tmp_path / f"seed-{seed}"
-        folder.mkdir()
-        (folder / "evaluation.json").write_text(json.dumps(of_run(seed=seed)))
-        settings = {"seed": seed, "threads": seed + 1, "training": {"steps": steps}}
-        config = {"dataset": "abc", "settings": settings}
-        (folder / "config.json").write_text(json.dumps(config))
+        write_run(tmp_path, seed, {"threads": seed + 1, "training": {"steps": steps}})
     assert collate(find_records([tmp_path / "seed-0", tmp_path / "seed-1"]))
-    said = r"/seed-1 and .*/seed-2 differ in steps \(60 and 70\): report them apart$"
+    said = r"/seed-0 and .*/seed-2 differ in steps \(60 and 70\): report them apart$"
     with pytest.raises(UsageError, match=said):
         collate(find_records([tmp_path]))
     # An evaluation in a folder of its own says how many episodes it had.
@@ -144,6 +146,37 @@ def test_runs_of_other_settings_are_one_sentence(tmp_path: Path) -> None:
     other["protocol"]["repetitions"] = 1
     with pytest.raises(UsageError, match=r"^a and b differ in repetitions \(3 and 1\)"):
         collate([one, other])
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"actor_critic": {"behavior_cloning": 1.0}}, r"behavior_cloning \(0\.0 and 1\.0\)"),
+        ({"precision": "bfloat16"}, r"precision \(float32 and bfloat16\)"),
+    ],
+)
+def test_a_setting_that_one_run_leaves_out(
+    settings: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    write_run(tmp_path, 0, {})
+    write_run(tmp_path, 1, settings)
+    with pytest.raises(UsageError, match=rf"differ in {said}: report them apart$"):
+        collate(find_records([tmp_path]))
+
+
+def test_runs_of_other_devices_are_one_row(tmp_path: Path) -> None:
+    write_run(tmp_path, 0, {})
+    write_run(tmp_path, 1, {"device": "cuda"})
+    assert collate(find_records([tmp_path]))[0].seeds == (0, 1)
+
+
+def test_a_run_without_settings_hides_no_difference(tmp_path: Path) -> None:
+    for seed, settings in enumerate(({"training": {"steps": 60}}, None)):
+        write_run(tmp_path, seed, settings)
+    assert collate(find_records([tmp_path]))
+    write_run(tmp_path, 2, {"training": {"steps": 70}})
+    with pytest.raises(UsageError, match=r"/seed-0 and .*/seed-2 differ in steps"):
+        collate(find_records([tmp_path]))
 
 
 def test_the_interval_is_of_the_mean() -> None:
