@@ -5,9 +5,12 @@ from __future__ import annotations
 import errno
 import io
 import re
+import runpy
+import sys
 from pathlib import Path
 
 import pytest
+import tyro
 from rich.console import Console
 
 from ctmrl.console import TrainingDisplay, run_command
@@ -143,3 +146,24 @@ def test_the_live_table_ends_with_an_error() -> None:
         raise UsageError("diverged")
     with TrainingDisplay(console, 60, 0, 3):
         pass
+
+
+@pytest.mark.parametrize(
+    ("module", "said"),
+    [
+        ("train", "Stopped. The same command goes on from the last checkpoint.\n"),
+        *((name, "Stopped.\n") for name in ("evaluate", "report", "profile")),
+    ],
+)
+def test_only_training_says_that_it_goes_on(
+    module: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tyro, "cli", stopped)
+    monkeypatch.setattr(sys, "argv", [module])
+    monkeypatch.delitem(sys.modules, f"ctmrl.{module}", raising=False)
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module(f"ctmrl.{module}", run_name="__main__")
+    assert (end.value.code, capsys.readouterr().err) == (130, said)
