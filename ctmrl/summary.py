@@ -71,22 +71,29 @@ def find_records(paths: list[Path]) -> list[dict[str, Any]]:
         try:
             record = json.loads(file.read_bytes())
             record["run"] = str(file.parent)
-            record["settings"] = _settings(file.with_name("config.json"))
             _check(record)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UsageError(
                 f"{file} is not an evaluation of a run ({error}): move it away"
             ) from None
+        record["settings"] = _settings(file.with_name("config.json"))
         records.append(record)
     return records
 
 
 def _settings(file: Path) -> dict[str, Any]:
-    """What a run's result depends on beside its seed, by name; empty without a run's config."""
+    """What a run's result depends on beside its seed, by name; empty without a run's config.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
     if not file.exists():
         return {}
-    config = json.loads(file.read_bytes())
-    settings = {"dataset": config["dataset"], **with_later_settings(config["settings"])}
+    try:
+        config = json.loads(file.read_bytes())
+        settings = {"dataset": config["dataset"], **with_later_settings(config["settings"])}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{file} is not a run's config ({error}): move its run away") from None
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         flat |= value if isinstance(value, dict) else {name: value}

@@ -169,8 +169,8 @@ _POINT_SMOKE = Budget(
 def _point_rows(sac: SACSettings) -> dict[str, Budget]:
     """A point robot's budgets: the standard and the quick one are the paper's.
 
-    More steps teach the behaviour policies of PointRobot and SparsePointRobot more, and methods
-    less: docs/fleet.md has both.
+    More steps teach the behaviour policies of PointRobot and SparsePointRobot more, but CTMRL was
+    worse on their data in the trials of docs/fleet.md.
     """
     paper = replace(_POINT_PAPER, sac=sac)
     same = (replace(paper, name=name) for name in ("standard", "quick"))

@@ -182,7 +182,7 @@ def _description(dataset: Dataset, data: TaskData) -> str:
     named = ", ".join(f"{name} {value:.6g}" for name, value in params)
     return (
         f"Task {data.task} ({data.meta['split']}) of {index['env_id']}: {named}. Budget "
-        f"{index['budget']}, seed {index['seed']}. The reference scores are the mean returns of "
+        f"{index['budget']}, seed {index['seed']}. The reference scores are the returns of "
         "the random policy and of the best known one on this task. Exported from the dataset with "
         f"the SHA-256 {dataset.hash}."
     )

@@ -179,6 +179,15 @@ def test_a_run_without_settings_hides_no_difference(tmp_path: Path) -> None:
         collate(find_records([tmp_path]))
 
 
+@pytest.mark.parametrize("text", ["{", "[]", '{"dataset": "abc"}'])
+def test_a_config_that_cannot_be_read_is_named(text: str, tmp_path: Path) -> None:
+    write_run(tmp_path, 0, {})
+    (tmp_path / "seed-0" / "config.json").write_text(text)
+    said = rf"^{tmp_path}/seed-0/config.json is not a run's config \(.*\): move its run away$"
+    with pytest.raises(UsageError, match=said):
+        find_records([tmp_path])
+
+
 def test_the_interval_is_of_the_mean() -> None:
     values = np.random.default_rng(0).normal(-6.0, 0.5, 29)
     low, high = interval(values)
