@@ -6,6 +6,8 @@ then replays without Python.
 
 from __future__ import annotations
 
+import functools
+import time
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -18,18 +20,37 @@ from datagen.budgets import Precision
 
 WARM_UP = 3
 """Calls before a recording, as many as torch's documentation has."""
+TURNS = 9
+"""Of which the least time counts, so that a busy machine does not."""
 
 
 def best_precision(device: torch.device | str = "cpu") -> Precision:
-    """bfloat16 where the hardware has units for its matrix products, float32 elsewhere.
+    """bfloat16 where the hardware multiplies it faster than float32, float32 elsewhere.
 
-    AVX-512 can multiply bfloat16 too, but slower than float32 (docs/fleet.md).
+    AMX always does. AVX-512's instructions for it do on some processors (AMD's) and not on others
+    (docs/fleet.md), so where they are all there is, both are timed, once a process.
     """
     if torch.device(device).type == "cuda":
         return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float32"
     # Older versions of torch cannot tell.
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
-    return "bfloat16" if capabilities.get("amx_bf16") else "float32"
+    fast = capabilities.get("amx_bf16") or (
+        capabilities.get("avx512_bf16") and bfloat16_gain() > 1.5
+    )
+    return "bfloat16" if fast else "float32"
+
+
+@functools.cache
+def bfloat16_gain() -> float:
+    """How many times as fast as in float32 a processor multiplies matrices in bfloat16."""
+    least = dict.fromkeys((torch.float32, torch.bfloat16), float("inf"))
+    for _ in range(TURNS):
+        for dtype in least:
+            rows, weight = torch.ones(2048, 256, dtype=dtype), torch.ones(256, 256, dtype=dtype)
+            start = time.perf_counter()
+            rows @ weight
+            least[dtype] = min(least[dtype], time.perf_counter() - start)
+    return least[torch.float32] / least[torch.bfloat16]
 
 
 def check_precision(precision: str, device: str) -> Precision:

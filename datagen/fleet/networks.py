@@ -31,7 +31,8 @@ class BatchedMLP(nn.Module):
         Args:
             sizes: of the input, each hidden layer and the output.
             generators: one a task.
-            precision: of the matrix products.
+            precision: of the matrix products. The last layer's output is float32's always: a value
+                of 100 and more differs between actions by less than bfloat16's 8 bits can tell.
         """
         super().__init__()
         self.dtype = getattr(torch, precision)
@@ -87,12 +88,16 @@ class _Pass(torch.autograd.Function):
     def forward(ctx: Any, inputs: Tensor, net: BatchedMLP, *parameters: Tensor) -> Tensor:
         last = len(net.lower) - 1
         values = [inputs.to(net.dtype)]
-        for layer, (weight, bias) in enumerate(net.lower):
-            value = torch.baddbmm(bias, values[-1], weight)
-            values.append(value if layer == last else value.relu_())
+        for weight, bias in net.lower[:last]:
+            values.append(torch.baddbmm(bias, values[-1], weight).relu_())
         # Without the output: it knows its way back to here, and the circle would keep both.
-        ctx.net, ctx.values, ctx.parameters = net, values[:-1], len(parameters)
-        return values[-1].float()
+        ctx.net, ctx.values, ctx.parameters = net, values, len(parameters)
+        if net.dtype == torch.float32:
+            return torch.baddbmm(net.biases[last], values[last], net.weights[last])
+        # Transposed: a product with one column is slow, one with a single row is not.
+        across = net.weights[last].transpose(1, 2)
+        product = torch.bmm(across, values[last].float().transpose(1, 2))
+        return product.transpose(1, 2) + net.biases[last]
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:

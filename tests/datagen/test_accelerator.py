@@ -10,7 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from datagen import accelerator
-from datagen.accelerator import WARM_UP, Inlet, best_precision, check_precision, recorded
+from datagen.accelerator import (
+    WARM_UP,
+    Inlet,
+    best_precision,
+    bfloat16_gain,
+    check_precision,
+    recorded,
+)
 from tests.datagen.tape import pretend_cuda
 
 CUDA = torch.device("cuda")
@@ -18,18 +25,28 @@ CUDA = torch.device("cuda")
 
 def test_the_best_precision_is_that_of_the_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
     assert best_precision() in ("float32", "bfloat16")
-    for capabilities, best in (
-        ({"amx_bf16": True}, "bfloat16"),
-        ({"avx512_bf16": True, "amx_bf16": False}, "float32"),
-        ({"avx512_f": True, "avx512_bf16": False}, "float32"),
-        ({}, "float32"),
+    only_avx512 = {"avx512_bf16": True, "amx_bf16": False}
+    for capabilities, gain, best in (
+        ({"amx_bf16": True}, 0.0, "bfloat16"),
+        (only_avx512, 4.0, "bfloat16"),
+        (only_avx512, 1.4, "float32"),
+        ({"avx512_f": True, "avx512_bf16": False}, 9.0, "float32"),
+        ({}, 9.0, "float32"),
     ):
+        monkeypatch.setattr(accelerator, "bfloat16_gain", lambda held=gain: held)
         monkeypatch.setattr(
             torch.cpu, "get_capabilities", lambda held=capabilities: held, raising=False
         )
         assert best_precision("cpu") == check_precision("auto", "cpu") == best
     monkeypatch.delattr(torch.cpu, "get_capabilities")
     assert best_precision() == "float32"
+
+
+def test_the_gain_of_bfloat16_is_measured_once() -> None:
+    accelerator.bfloat16_gain.cache_clear()
+    gain = bfloat16_gain()
+    assert 0 < gain < float("inf")
+    assert bfloat16_gain() == gain
 
 
 def test_a_precision_that_is_given_stays(monkeypatch: pytest.MonkeyPatch) -> None:
