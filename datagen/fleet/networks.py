@@ -66,15 +66,19 @@ class BatchedMLP(nn.Module):
 
     @property
     def lower(self) -> list[tuple[Tensor, Tensor]]:
-        """Weight and bias of each layer in the precision of the matrix products."""
+        """Weight and bias of each layer as it is computed with, the last one's in float32."""
         return self._lower
 
     @torch.no_grad()
     def refresh(self) -> None:
         """Take over what an optimiser has done to the parameters; call it after each step."""
         pairs = zip(self.weights, self.biases, strict=True)
-        if self.dtype == torch.float32 or not self._lower:
-            self._lower = [(w.detach().to(self.dtype), b.detach().to(self.dtype)) for w, b in pairs]
+        if self.dtype == torch.float32:
+            self._lower = [(w.detach(), b.detach()) for w, b in pairs]
+            return
+        if not self._lower:
+            *hidden, last = [(w.detach().clone(), b.detach().clone()) for w, b in pairs]
+            self._lower = [*((w.to(self.dtype), b.to(self.dtype)) for w, b in hidden), last]
             return
         for (weight, bias), (w, b) in zip(self._lower, pairs, strict=True):
             weight.copy_(w)
@@ -92,12 +96,12 @@ class _Pass(torch.autograd.Function):
             values.append(torch.baddbmm(bias, values[-1], weight).relu_())
         # Without the output: it knows its way back to here, and the circle would keep both.
         ctx.net, ctx.values, ctx.parameters = net, values, len(parameters)
+        weight, bias = net.lower[last]
         if net.dtype == torch.float32:
-            return torch.baddbmm(net.biases[last], values[last], net.weights[last])
+            return torch.baddbmm(bias, values[last], weight)
         # Transposed: a product with one column is slow, one with a single row is not.
-        across = net.weights[last].transpose(1, 2)
-        product = torch.bmm(across, values[last].float().transpose(1, 2))
-        return product.transpose(1, 2) + net.biases[last]
+        product = torch.bmm(weight.transpose(1, 2), values[last].float().transpose(1, 2))
+        return product.transpose(1, 2) + bias
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
@@ -111,7 +115,7 @@ class _Pass(torch.autograd.Function):
                 net.biases[layer].grad.copy_(gradient.sum(1, keepdim=True))
             if layer == 0 and not ctx.needs_input_grad[0]:
                 return (None, None, *nothing)
-            across = net.lower[layer][0].transpose(1, 2)
+            across = net.lower[layer][0].transpose(1, 2).to(net.dtype)
             # Of a single output this is an outer product, which needs no product of matrices.
             outer = across.shape[1] == 1
             gradient = gradient * across if outer else torch.bmm(gradient, across)

@@ -131,6 +131,19 @@ def test_bfloat16_is_as_close_as_torchs_own() -> None:
         assert number > 0 or error < 0.014
 
 
+def test_values_far_from_0_are_told_apart() -> None:
+    net, low = mlp(), mlp("bfloat16")
+    inputs = normal(TASKS, 500, 5)
+    with torch.no_grad():
+        near = low(inputs)
+        for value in (net, low):
+            value.biases[-1].fill_(200.0)
+            value.refresh()
+        # 1 apart are the numbers of bfloat16 there.
+        torch.testing.assert_close(low(inputs), near + low.biases[-1] - mlp().biases[-1])
+        assert 0 < (low(inputs) - net(inputs)).abs().amax() < 0.05
+
+
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_after_a_step_it_must_be_refreshed(precision: Precision) -> None:
     net, inputs = mlp(precision), normal(TASKS, BATCH, 5)
