@@ -3,10 +3,11 @@ r"""Gradient steps of CTMRL's meta-training a second: ours beside `plain_learner
     python benchmarks/meta_train_steps.py --out benchmarks/results/meta_train_steps.csv
 
 Whole steps with sampling and optimisers, on random numbers in the shape of the dataset: the
-field's settings on HalfCheetahVel, and those of `python -m ctmrl.train` without an argument; before
-the codebook is placed and with it. One run of one or two threads, and two seeds side by side, one
-thread each, whose rates add up. Sides take turns; a ratio is taken within one turn, so that a busy
-machine slows both sides of it. The precision is that of ours; the plain side is in float32 always.
+field's settings on HalfCheetahVel and PointRobot, and those of `python -m ctmrl.train` without an
+argument; before the codebook is placed and with it. One run of one or two threads, and two seeds
+side by side, one thread each, whose rates add up. Sides take turns; a ratio is taken within one
+turn, so that a busy machine slows both sides of it. The precision is that of ours; the plain side
+is in float32 always.
 """
 
 from __future__ import annotations
@@ -31,16 +32,20 @@ from rich.table import Table
 
 from ctmrl.config import RunConfig
 from ctmrl.data import OfflineData
+from ctmrl.errors import UsageError
 from ctmrl.meta_train import Learner
 from ctmrl.methods.ctmrl import CTMRL
 from ctmrl.precision import Precision
-from ctmrl.presets import preset
+from ctmrl.presets import known_preset, preset
 from ctmrl.synthetic import synthetic_dataset
 from ctmrl.threads import settle_threads
 from datagen.accelerator import check_precision
+from meta_envs import resolve
 
 EPISODES = 20
-"""Of each task's random numbers."""
+"""Of each task's random numbers, at least."""
+CONTEXT_ROWS = 1_020
+"""Of the episodes behind a context, at most: the random data are few."""
 ARRANGEMENTS = {
     "one run, one thread": (1, 1),
     "one run, two threads": (1, 2),
@@ -56,7 +61,11 @@ class Benchmark:
 
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
     """Of our matrix products; the plain implementation's are float32."""
-    cases: tuple[str, ...] = ("half_cheetah_vel paper", "point_robot_wind standard")
+    cases: tuple[str, ...] = (
+        "half_cheetah_vel paper",
+        "point_robot paper",
+        "point_robot_wind standard",
+    )
     """Environment and settings."""
     repetitions: int = 7
     """Turns; the table has their medians."""
@@ -83,14 +92,16 @@ class Result:
 
 
 def settings(case: str, seed: int) -> RunConfig:
-    """The settings of a case; on HalfCheetahVel those of the field."""
-    if case == "point_robot_wind standard":
-        return preset("point_robot_wind", "ctmrl", "standard", seed=seed)
-    if case != "half_cheetah_vel paper":
-        raise SystemExit(f"no case '{case}'")
-    config = preset("half_cheetah_vel", "ctmrl", "paper", seed=seed)
-    # The random data are few; how many episodes are behind a context is nothing to a step's time.
-    return replace(config, training=replace(config.training, context_episodes=5))
+    """The settings of a case, with fewer episodes behind a context where they are long."""
+    env, _, name = case.partition(" ")
+    try:
+        config = preset(env, "ctmrl", known_preset(name), seed=seed)
+    except UsageError as error:
+        raise SystemExit(f"--cases '{case}': {error}") from None
+    # How many episodes are behind a context is nothing to a step's time.
+    most = CONTEXT_ROWS // resolve(env).horizon
+    episodes = min(config.training.context_episodes, most)
+    return replace(config, training=replace(config.training, context_episodes=episodes))
 
 
 class Task(NamedTuple):
@@ -105,7 +116,7 @@ class Task(NamedTuple):
 def build(task: Task, seed: int) -> Callable[[], object]:
     """A learner's gradient step."""
     config = replace(settings(task.case, seed), precision=task.precision)
-    dataset = synthetic_dataset(config.env, EPISODES)
+    dataset = synthetic_dataset(config.env, max(EPISODES, 2 * config.training.context_episodes))
     data = OfflineData(dataset, dataset.train_tasks)
     if task.engine == "ours":
         ours = Learner(config, data)
@@ -207,6 +218,8 @@ def main() -> int:
     options, console = tyro.cli(Benchmark), Console()
     table = Table("settings", "codebook", "arrangement", "ours", "plain", "ratio")
     results = []
+    for case in options.cases:
+        settings(case, 0)
     for case in options.cases:
         for codebook in (False, True):
             for one in measure(case, codebook, options):
