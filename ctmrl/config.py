@@ -86,6 +86,7 @@ class RunConfig:
     float32. auto is bfloat16 where the hardware multiplies it faster (AMX, most GPUs, some AVX-512)
     and float32 elsewhere; a run goes on in the precision it began with. The MuJoCo robots' default
     is auto."""
+    device: str = "cpu"
     """Where meta-training computes: cpu, cuda, or cuda:1 for the second GPU. On a GPU a gradient
     step is one CUDA graph, which --seeds share it with. Evaluation is on the processor. A run goes
     on on the kind of device it began on."""
