@@ -12,6 +12,7 @@ import tyro
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from torch import Tensor
 
     from ctmrl.agent import Agent
     from ctmrl.config import RunConfig
@@ -26,8 +27,14 @@ class EvaluateConfig:
     """Run folder, such as runs/point_robot_wind/ctmrl/seed-0."""
     fresh: int = 0
     """Instead of the dataset's tasks, this many fresh ones from the same distribution."""
+    offline: bool = False
+    """Contexts of the tasks' own offline data in place of exploration: what the field calls the
+    offline protocol. The dataset must have the test tasks."""
+    data: Path | None = None
+    """Dataset folder for --offline; default datasets/<environment>."""
     seed: int | None = None
-    """Of exploration, and of the fresh tasks; the run's own seed by default."""
+    """Of exploration or of the offline contexts, and of the fresh tasks; the run's own seed by
+    default."""
     out: Path | None = None
     """Also write the result as JSON and both pictures into this folder."""
     repetitions: int | None = field(default=None)
@@ -37,13 +44,14 @@ class EvaluateConfig:
     diverged."""
 
 
-def evaluate_agent(
+def evaluate_agent(  # noqa: PLR0913 - each decides what is measured
     agent: Agent,
     config: RunConfig,
     tasks: TaskSet,
     groups: dict[str, NDArray[np.int64]],
     best_behavior: dict[int, float],
     seed: int,
+    given: dict[str, Tensor] | None = None,
 ) -> dict[str, Any]:
     """Meta-test an agent.
 
@@ -54,6 +62,7 @@ def evaluate_agent(
         groups: rows of it by name, such as `unseen` and `seen`.
         best_behavior: return of each task's best behaviour policy, where known.
         seed: of the exploration.
+        given: contexts of each group in place of exploration, as `offline_contexts` gives them.
 
     Returns:
         What evaluation.json holds; returns are undiscounted sums, means where not said otherwise.
@@ -69,12 +78,12 @@ def evaluate_agent(
     references = reference_returns(tasks, threads=threads)
     record: dict[str, Any] = {
         "env": config.env,
-        "method": config.label,
+        "method": config.label if given is None else f"{config.label}, offline contexts",
         "seed": config.seed,
         "evaluation_seed": seed,
         "protocol": {
-            "random_episodes": config.meta_test.random_episodes,
-            "policy_episodes": config.meta_test.policy_episodes,
+            "random_episodes": 0 if given else config.meta_test.random_episodes,
+            "policy_episodes": 0 if given else config.meta_test.policy_episodes,
             "scored_episodes": config.meta_test.scored_episodes,
             "repetitions": config.meta_test.repetitions,
         },
@@ -84,7 +93,7 @@ def evaluate_agent(
     if agent.method.note:
         record["note"] = agent.method.note
     test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed, threads)
-    results = test.run(groups)
+    results = test.run(groups, given=given)
     for name, rows in groups.items():
         result = results[name]
         anchors = {key: float(values[rows].mean()) for key, values in references.items()}
@@ -119,6 +128,29 @@ def _check_out(config: EvaluateConfig) -> None:
         raise UsageError(f"--out {config.out} is {whose}: choose another folder")
 
 
+def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
+    """The run's settings, with what the evaluation has of its own.
+
+    Raises:
+        UsageError: options that cannot be used.
+    """
+    import dataclasses
+
+    from ctmrl.errors import UsageError
+
+    _check_out(config)
+    if config.fresh < 0:
+        raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
+    if config.fresh and config.offline:
+        raise UsageError("--offline is for tasks with data, and --fresh tasks have none")
+    if config.data is not None and not config.offline:
+        raise UsageError("--data is for --offline: no other evaluation reads a dataset")
+    if config.repetitions is not None:
+        protocol = dataclasses.replace(run.meta_test, repetitions=config.repetitions)
+        run = dataclasses.replace(run, meta_test=protocol)
+    return dataclasses.replace(run, data=config.data)
+
+
 def main(config: EvaluateConfig) -> None:
     """Evaluate and print."""
     import dataclasses
@@ -129,8 +161,8 @@ def main(config: EvaluateConfig) -> None:
     from ctmrl import runs
     from ctmrl.agent import load_agent
     from ctmrl.config import check_settings
-    from ctmrl.errors import UsageError
     from ctmrl.methods.base import Dimensions
+    from ctmrl.offline import offline_contexts
     from ctmrl.presets import config_from_settings
     from ctmrl.report import result_table, write_pictures
     from ctmrl.threads import settle_threads
@@ -138,14 +170,8 @@ def main(config: EvaluateConfig) -> None:
     from meta_envs import task_set
 
     stored = runs.read_json(config.run / runs.CONFIG)
-    run_config = config_from_settings(stored, config.run / runs.CONFIG)
-    if config.repetitions is not None:
-        protocol = dataclasses.replace(run_config.meta_test, repetitions=config.repetitions)
-        run_config = dataclasses.replace(run_config, meta_test=protocol)
+    run_config = _settings(config, config_from_settings(stored, config.run / runs.CONFIG))
     seed = run_config.seed if config.seed is None else config.seed
-    _check_out(config)
-    if config.fresh < 0:
-        raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
     with runs.fitting(config.run / runs.CONFIG):
         check_settings(dataclasses.replace(run_config, seed=seed))
         dims = Dimensions(*(stored["dimensions"][name] for name in Dimensions._fields))
@@ -165,7 +191,8 @@ def main(config: EvaluateConfig) -> None:
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
-    record = evaluate_agent(agent, run_config, tasks, groups, best, seed)
+    given = offline_contexts(run_config, groups, seed) if config.offline else None
+    record = evaluate_agent(agent, run_config, tasks, groups, best, seed, given)
     console = Console()
     if step < dims.steps:
         record["step"] = step

@@ -1,9 +1,12 @@
-"""The two-phase meta-test: explore at random, then with the policy, then score fresh episodes."""
+"""The two-phase meta-test: explore at random, then with the policy, then score fresh episodes.
+
+Or without exploration, on contexts that are given.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -90,6 +93,11 @@ class _Adaptation:
         self.generator = torch.Generator().manual_seed(test.seed)
         self.total = torch.zeros(self.size, self.encoder.z_dim, dtype=torch.float64)
         self.count = torch.zeros(self.size, 1, dtype=torch.float64)
+
+    def read(self, context: Tensor) -> None:
+        """Add transitions [n, T, F] of each task to its context."""
+        self.total += self.encoder.encode(context).double().sum(dim=1)
+        self.count += context.shape[1]
 
     @property
     def z(self) -> Tensor:
@@ -180,6 +188,7 @@ class MetaTest:
         self,
         groups: Mapping[str, NDArray[np.int64]],
         each_step: Callable[[], None] | None = None,
+        given: Mapping[str, Tensor] | None = None,
     ) -> dict[str, MetaTestResult]:
         """Adapt to each task of some groups and score it; the results by the groups' names.
 
@@ -189,7 +198,12 @@ class MetaTest:
         Args:
             groups: rows of the task set by name.
             each_step: called before each step; what it raises ends the meta-test.
+            given: contexts to score each group's tasks on in place of exploration, transitions
+                [R * n, T, O + A + 1 + O], repetition by repetition.
         """
+        config = self.config
+        if given is not None:
+            config = replace(config, random_episodes=0, policy_episodes=0)
         rows = {name: np.tile(own, self.config.repetitions) for name, own in groups.items()}
         every = np.concatenate([*rows.values()])
         env = MetaVectorEnv(self.tasks.env, tasks=every, task_set=self.tasks, threads=self.threads)
@@ -200,7 +214,10 @@ class MetaTest:
         for name, own in rows.items():
             begin = at_work[-1][1].stop if at_work else 0
             place = slice(begin, begin + len(own))
-            protocol = _Adaptation(env, place, self).protocol(self.config)
+            adaptation = _Adaptation(env, place, self)
+            if given is not None:
+                adaptation.read(given[name])
+            protocol = adaptation.protocol(config)
             actions[place] = next(protocol)
             at_work.append((name, place, protocol))
         results: dict[str, MetaTestResult] = {}

@@ -1,0 +1,114 @@
+"""The meta-test on contexts of the tasks' own data."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ctmrl.config import RunConfig
+from ctmrl.errors import UsageError
+from ctmrl.meta_test import MetaTest
+from ctmrl.networks import Actor, ContextEncoder
+from ctmrl.offline import offline_contexts
+from ctmrl.presets import preset
+from datagen.dataset import open_dataset
+from meta_envs import ENVIRONMENTS, MetaEnv, task_set
+from tests.ctmrl.commands import Commands, contents
+from tests.ctmrl.conftest import FinishedRun
+
+GROUPS = {"unseen": np.array([2, 7]), "seen": np.array([0, 4, 8])}
+
+
+@pytest.fixture
+def config(wind_path: Path) -> RunConfig:
+    made = preset("point_robot_wind", "ctmrl", "smoke", data=wind_path)
+    return dataclasses.replace(
+        made, meta_test=dataclasses.replace(made.meta_test, repetitions=3, scored_episodes=1)
+    )
+
+
+def test_each_context_is_of_its_own_task(config: RunConfig, wind_path: Path) -> None:
+    found = offline_contexts(config, GROUPS, seed=1)
+    dataset = open_dataset(wind_path)
+    for name, rows in GROUPS.items():
+        contexts = found[name].numpy()
+        assert contexts.shape == (3 * len(rows), config.training.context_size, 2 + 2 + 1 + 2)
+        for task, context in zip(np.tile(rows, 3), contexts, strict=True):
+            data = dataset.read(int(task))
+            before = [data.observations, data.actions, data.rewards[:, None]]
+            own = np.concatenate([*before, data.next_observations], axis=1)
+            rows_of = [int(np.flatnonzero((own == row).all(axis=1))[0]) for row in context]
+            episodes = {int(data.columns["episode"][row]) for row in rows_of}
+            assert len(episodes) <= config.training.context_episodes
+    assert len(np.unique(found["seen"].numpy()[:, 0], axis=0)) == 9, "each repetition has its own"
+
+
+def test_draws_depend_on_the_seed_and_not_on_other_groups(config: RunConfig) -> None:
+    found, other = (offline_contexts(config, GROUPS, seed) for seed in (1, 2))
+    alone = offline_contexts(config, {"seen": GROUPS["seen"]}, seed=1)
+    assert torch.equal(found["seen"], alone["seen"])
+    assert not torch.equal(found["seen"], other["seen"])
+
+
+def test_the_policy_is_scored_on_the_given_context(config: RunConfig) -> None:
+    ones = torch.ones(7)
+    encoder = ContextEncoder((0.1 * ones, 0.5 * ones), 2, (11,), 5)
+    actor = Actor((torch.zeros(2), torch.ones(2)), 5, (13,), 2)
+    tasks, given = task_set("point_robot_wind"), offline_contexts(config, GROUPS, seed=1)
+    results = MetaTest(encoder, actor, tasks, config.meta_test, 0).run(GROUPS, given=given)
+    for name, rows in GROUPS.items():
+        with torch.no_grad():
+            z = encoder(given[name])
+        result = results[name]
+        assert result.curve.shape == (1, len(rows))
+        np.testing.assert_allclose(result.contexts.reshape(z.shape), z, rtol=1e-5, atol=1e-6)
+        for place, task in enumerate(np.tile(rows, 3)):
+            env = MetaEnv("point_robot_wind", int(task))
+            obs, total = env.reset(seed=place)[0], 0.0
+            for _ in range(ENVIRONMENTS["point_robot_wind"].horizon):
+                action = actor.act(torch.from_numpy(obs)[None], z[place : place + 1])[0].numpy()
+                obs, reward, *_ = env.step(action)
+                total += float(reward)
+            assert result.returns.flatten()[place] == pytest.approx(total, rel=1e-4)
+
+
+def test_the_command(wind_path: Path, commands: Commands, tmp_path: Path) -> None:
+    data, run = ("--data", str(wind_path)), tmp_path / "run"
+    train = ("ctmrl.train", "--preset", "smoke", "--steps", "20", "--validate", *data)
+    assert commands.run(*train, "--out", str(run)) == 0, commands.output()
+    words = ("ctmrl.evaluate", str(run), "--offline", *data)
+    assert commands.run(*words, "--out", str(tmp_path / "a")) == 0, commands.output()
+    assert "ctmrl, offline contexts" in commands.output()
+    assert commands.run(*words, "--out", str(tmp_path / "b")) == 0
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    record = json.loads((tmp_path / "a" / "evaluation.json").read_text())
+    assert record["method"] == "ctmrl, offline contexts"
+    assert record["protocol"]["random_episodes"] == record["protocol"]["policy_episodes"] == 0
+    assert all(len(group["curve"]) == 1 for group in record["groups"].values())
+
+
+def test_tasks_without_data_are_named(config: RunConfig, good_path: Path) -> None:
+    config = dataclasses.replace(config, data=good_path)
+    with pytest.raises(UsageError, match=r"data of the unseen tasks, and .* has none of 2, 7: `py"):
+        offline_contexts(config, GROUPS, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--offline", "--fresh", "3"), "--offline is for tasks with data, and --fresh tasks have"),
+        (("--data", "somewhere"), "--data is for --offline: no other evaluation reads a dataset"),
+        (("--offline", "--data", "nowhere"), "nowhere"),
+    ],
+)
+def test_options_that_do_not_fit(
+    words: tuple[str, ...], message: str, finished_run: FinishedRun, commands: Commands
+) -> None:
+    assert commands.run("ctmrl.evaluate", str(finished_run.path), *words) == 2
+    assert message in commands.output()
+    assert "Traceback" not in commands.output()
