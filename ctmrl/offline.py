@@ -1,8 +1,9 @@
-"""Contexts of the tasks' own data, for a meta-test without exploration."""
+"""A run's dataset, and contexts of its tasks' own data for a meta-test without exploration."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,8 +13,29 @@ from torch import Tensor
 from ctmrl.config import RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.errors import UsageError
-from ctmrl.train import open_data
-from datagen.files import collect_command
+from datagen.dataset import Dataset, open_dataset
+
+
+def open_data(config: RunConfig) -> Dataset:
+    """Open the run's slice of its dataset.
+
+    Raises:
+        UsageError: it is of another environment or has no training tasks.
+        DatasetError: it is missing or damaged.
+    """
+    path = config.data or Path("datasets") / config.env
+    dataset = open_dataset(path, verify=False)
+    if dataset.env != config.env:
+        raise UsageError(
+            f"{path} is of {dataset.env}, not of {config.env}: "
+            f"give --env {dataset.env} or another --data"
+        )
+    if len(dataset.train_tasks) < 2:
+        raise UsageError(
+            f"{path} has {len(dataset.train_tasks)} training tasks, at least 2 are needed: "
+            f"python -m datagen.collect --env {config.env} collects them"
+        )
+    return dataset.select(config.quality, config.data_episodes)
 
 
 def offline_contexts(
@@ -39,8 +61,8 @@ def offline_contexts(
         if missing := sorted({*rows.tolist()} - {*dataset.tasks.tolist()}):
             raise UsageError(
                 f"--offline needs data of the {name} tasks, and {dataset.path} has none of "
-                f"{', '.join(map(str, missing))}: "
-                f"`{collect_command(dataset.path, dataset.index)}` collects all tasks"
+                f"{', '.join(map(str, missing))}: python -m datagen.collect --env {config.env} "
+                f"--out {dataset.path}, with its --budget and --seed, collects all tasks"
             )
         data = OfflineData(dataset, rows, dense_context=config.context.dense_reward_in_context)
         draws = torch.Generator().manual_seed(seed)

@@ -247,8 +247,8 @@ def table_of(parts: dict[str, Part], peak: float) -> Table:
 def open_or_make(config: RunConfig, console: Console) -> OfflineData:
     """The run's training data, or random numbers in its shape where there is no dataset."""
     from ctmrl.data import OfflineData
+    from ctmrl.offline import open_data
     from ctmrl.synthetic import synthetic_dataset
-    from ctmrl.train import open_data
     from meta_envs import resolve
 
     if config.data is None and not (Path("datasets") / config.env).exists():

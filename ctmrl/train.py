@@ -95,36 +95,12 @@ def check(config: RunConfig) -> Dataset:
     from ctmrl.config import check_settings
     from ctmrl.loggers import check_loggers
     from ctmrl.meta_train import usable_precision
+    from ctmrl.offline import open_data
 
     check_settings(config)
     check_loggers(config.loggers)
     usable_precision(config)
     return open_data(config)
-
-
-def open_data(config: RunConfig) -> Dataset:
-    """Open the run's slice of its dataset.
-
-    Raises:
-        UsageError: it is of another environment or has no training tasks.
-        DatasetError: it is missing or damaged.
-    """
-    from ctmrl.errors import UsageError
-    from datagen.dataset import open_dataset
-
-    path = config.data or Path("datasets") / config.env
-    dataset = open_dataset(path, verify=False)
-    if dataset.env != config.env:
-        raise UsageError(
-            f"{path} is of {dataset.env}, not of {config.env}: "
-            f"give --env {dataset.env} or another --data"
-        )
-    if len(dataset.train_tasks) < 2:
-        raise UsageError(
-            f"{path} has {len(dataset.train_tasks)} training tasks, at least 2 are needed: "
-            f"python -m datagen.collect --env {config.env} collects them"
-        )
-    return dataset.select(config.quality, config.data_episodes)
 
 
 def train(config: RunConfig, console: Console, watch: Watch | None = None) -> dict[str, Any]:

@@ -94,7 +94,7 @@ def test_the_command(wind_path: Path, commands: Commands, tmp_path: Path) -> Non
 
 def test_tasks_without_data_are_named(config: RunConfig, good_path: Path) -> None:
     config = dataclasses.replace(config, data=good_path)
-    with pytest.raises(UsageError, match=r"data of the unseen tasks, and .* has none of 2, 7: `py"):
+    with pytest.raises(UsageError, match=r"data of the unseen tasks, and .* has none of 2, 7: py"):
         offline_contexts(config, GROUPS, seed=0)
 
 
