@@ -36,7 +36,7 @@ class EvaluateConfig:
     """Of exploration or of the offline contexts, and of the fresh tasks; the run's own seed by
     default."""
     out: Path | None = None
-    """Also write the result as JSON and both pictures into this folder."""
+    """Also write the result as JSON and its pictures into this folder."""
     repetitions: int | None = field(default=None)
     """Independent adaptations of each task; the run's own number by default."""
     unfinished: bool = False

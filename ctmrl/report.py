@@ -94,10 +94,13 @@ def result_table(record: dict[str, Any]) -> Table:
 
 
 def write_pictures(record: dict[str, Any], folder: Path) -> None:
-    """Write adaptation.png and contexts.png into a folder."""
+    """Write adaptation.png, unless there was no exploration, and contexts.png into a folder."""
     from datagen.dataset import write_whole
 
-    for name, draw in (("adaptation.png", adaptation_figure), ("contexts.png", context_figure)):
+    pictures = {"adaptation.png": adaptation_figure, "contexts.png": context_figure}
+    if not record["protocol"]["random_episodes"] + record["protocol"]["policy_episodes"]:
+        del pictures["adaptation.png"]
+    for name, draw in pictures.items():
         buffer = BytesIO()
         # Without a version in it, so that equal results give equal bytes.
         draw(record).savefig(buffer, format="png", dpi=110, metadata={"Software": None})

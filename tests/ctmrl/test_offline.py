@@ -86,6 +86,7 @@ def test_the_command(wind_path: Path, commands: Commands, tmp_path: Path) -> Non
     assert "ctmrl, offline contexts" in commands.output()
     assert commands.run(*words, "--out", str(tmp_path / "b")) == 0
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    assert sorted(contents(tmp_path / "a")) == ["contexts.png", "evaluation.json"]
     record = json.loads((tmp_path / "a" / "evaluation.json").read_text())
     assert record["method"] == "ctmrl, offline contexts"
     assert record["protocol"]["random_episodes"] == record["protocol"]["policy_episodes"] == 0
