@@ -82,8 +82,8 @@ def evaluate_agent(  # noqa: PLR0913 - each decides what is measured
         "seed": config.seed,
         "evaluation_seed": seed,
         "protocol": {
-            "random_episodes": 0 if given else config.meta_test.random_episodes,
-            "policy_episodes": 0 if given else config.meta_test.policy_episodes,
+            "random_episodes": 0 if given is not None else config.meta_test.random_episodes,
+            "policy_episodes": 0 if given is not None else config.meta_test.policy_episodes,
             "scored_episodes": config.meta_test.scored_episodes,
             "repetitions": config.meta_test.repetitions,
         },

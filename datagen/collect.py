@@ -83,7 +83,7 @@ class CollectConfig:
     precision: Annotated[
         Literal["auto", "float32", "bfloat16"], tyro.conf.arg(metavar="auto|float32|bfloat16")
     ] = "auto"
-    """Of a fleet's matrix products: bfloat16 where the hardware has them, by default."""
+    """Of a fleet's matrix products; by default bfloat16 where the hardware multiplies it faster."""
     device: str = "cpu"
     """Where a fleet learns, such as cpu or cuda."""
     policies: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
