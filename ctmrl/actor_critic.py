@@ -57,6 +57,9 @@ class ActorCriticConfig:
     """How much more actions count in cloning that are better than the policy's: by e to this many
     times their advantage, in units of its spread. 0 clones all alike. Of no use without
     behavior_cloning."""
+    value_expectile: float = 0.0
+    """Above 0, the value network learns this expectile of Q at the data's own actions, as in IQL,
+    and so what the better of them are worth; 0 lets it learn the value of the policy."""
     value_from_data: bool = False
     """Let critics and value network begin at the value that the data's mean reward comes to, and
     not at 0, from where they take thousands of steps."""
@@ -148,7 +151,11 @@ class ActorCritic(nn.Module):
         q = self.critic(batch.obs, sample.action, z, layers=frozen(layers)).amin(dim=0)
         entropy_cost = self.entropy_coef * sample.log_prob
         expected = self.value(batch.obs, z)[0]
-        value = (expected - (q - entropy_cost).detach()).square().mean()
+        if expectile := self.config.value_expectile:
+            behind = at_data.amin(dim=0).detach() - expected
+            value = (torch.where(behind > 0, expectile, 1 - expectile) * behind.square()).mean()
+        else:
+            value = (expected - (q - entropy_cost).detach()).square().mean()
         regularizer = sample.mean.square().mean() + sample.log_std.square().mean()
         actor = (entropy_cost - q).mean()
         actor = actor + self.entropy_coef * self.config.regularizer * regularizer

@@ -135,6 +135,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys((f"{name}_weight" for name in _WEIGHTS), (0, math.inf)),
     **dict.fromkeys(("divergence_initial", "divergence_maximum"), (0, math.inf)),
     "code_decay": _SHARE,
+    "value_expectile": _SHARE,
     "data_episodes": (1, math.inf),
     "meta_batch": (2, math.inf),
     "memory": (0, math.inf),

@@ -95,6 +95,8 @@ GOAL: Settings = {
     "encoder_hidden": (200, 200, 200),
     "predictor_hidden": (128, 128),
 }
+# Twice as wide, the actor-critic comes within 3% of the optimum on data of weak policies.
+POINT = GOAL | {"hidden": (256, 256)}
 SQUARED: Settings = {"squared_errors": True}
 # Sized for minutes of a small machine. docs/methods/actor_critic.md compares what holds a policy to
 # the data; the rest was not searched.
@@ -117,6 +119,14 @@ ROBOT: Settings = {
     "policy_episodes": 2,
 }
 LEGS = ROBOT | {"random_episodes": 10}
+# Of the policy's own actions, far from the data's, values mislead: IQL's do not.
+ANT = ROBOT | {
+    "steps": 15_000,
+    "batch_size": 32,
+    "behavior_cloning": 5.0,
+    "cloning_advantage": 3.0,
+    "value_expectile": 0.8,
+}
 
 SMOKE: Settings = {
     "steps": 60,
@@ -139,13 +149,13 @@ OF_METHODS: dict[str, Settings] = {"ctmrl_released": {"divergence_wind_up": True
 """What a method has in every preset of every environment on top of those."""
 
 ROWS: dict[str, Row] = {
-    "point_robot": Row(8, PAPER_GOAL, GOAL),
+    "point_robot": Row(8, PAPER_GOAL, POINT),
     "point_robot_wind": Row(8, PAPER_WIND, {}),
     "sparse_point_robot": Row(4, PAPER_GOAL | SQUARED, GOAL | SQUARED | {"steps": 6_000}),
     "half_cheetah_vel": Row(16, PAPER_CHEETAH, ROBOT),
     "hopper_params": Row(16, PAPER_LEGS, LEGS),
     "walker_params": Row(4, PAPER_LEGS | {"z_dim": 40}, LEGS),
-    "ant_goal": Row(2, PAPER_ANT, ROBOT),
+    "ant_goal": Row(2, PAPER_ANT, ANT),
     "half_cheetah_dir": Row(1, PAPER_CHEETAH, ROBOT),
     "ant_dir": Row(2, PAPER_ANT, ROBOT),
     "humanoid_dir": Row(2, PAPER_HUMANOID, ROBOT),

@@ -9,7 +9,12 @@ LATER_SETTINGS: dict[str, Any] = {
     "data_episodes": None,
     "precision": "float32",
     "device": "cpu",
-    "actor_critic": {"behavior_cloning": 0.0, "cloning_advantage": 0.0, "value_from_data": False},
+    "actor_critic": {
+        "behavior_cloning": 0.0,
+        "cloning_advantage": 0.0,
+        "value_expectile": 0.0,
+        "value_from_data": False,
+    },
 }
 """Settings that came after the first runs, and what a run has that does not name them. Where they
 are this, config.json leaves them out: such a run is the same in every version, byte for byte."""

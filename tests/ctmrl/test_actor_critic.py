@@ -163,6 +163,23 @@ def test_behaviour_cloning_is_of_the_better_data_in_units_of_the_spread_of_q(
         assert_same(gradients(getattr(cloning, network)), gradients(getattr(plain, network)))
 
 
+def test_the_value_can_be_an_expectile_of_the_datas_own_actions() -> None:
+    plain, expectile = actor_critic(), actor_critic(value_expectile=0.8)
+    expectile.load_state_dict(plain.state_dict())
+    rows, z = double_batch(), contexts()
+    old = copy.deepcopy(expectile)
+    after_a_backward_pass(plain, rows, z)
+    metrics = after_a_backward_pass(expectile, rows, z)
+    behind = old.critic(rows.obs, rows.action, z).amin(dim=0).detach() - old.value(rows.obs, z)[0]
+    below, above = behind.clamp(max=0), behind.clamp(min=0)
+    assert below.min() < 0 < above.max()
+    loss = 0.2 * below.square().mean() + 0.8 * above.square().mean()
+    assert_same(gradients(expectile.value), of(loss, old.value))
+    assert metrics["loss/value"].item() == pytest.approx(loss.item(), rel=1e-6)
+    for network in ("critic", "actor"):
+        assert_same(gradients(getattr(expectile, network)), gradients(getattr(plain, network)))
+
+
 def test_critics_and_value_networks_begin_at_a_value() -> None:
     made = []
     for value in (0.0, -53.0):
