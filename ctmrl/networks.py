@@ -23,6 +23,12 @@ LARGEST_ACTION = 0.9999
 BLOCK = 1024
 """Rows a critic evaluates at once on a processor, and differentiates at once: what they need stays
 in the second cache, which makes 4096 rows a tenth faster to a fifth."""
+MLP_BLOCK = 4096
+"""The same of the other networks, which contexts of 16 x 1024 transitions make a fifth faster."""
+
+Layers = list[tuple[Tensor, Tensor]]
+"""Weight and bias of each layer: of a critic [heads, in, out] and [heads, 1, out], else as
+PyTorch's linear layer has them."""
 
 
 class MLP(nn.Sequential):
@@ -30,13 +36,21 @@ class MLP(nn.Sequential):
 
     def forward(self, x: Tensor) -> Tensor:
         """[*, in] -> [*, out], of the same type."""
-        h = lowered(x)
-        for layer in self:
-            if isinstance(layer, nn.Linear):
-                h = functional.linear(h, lowered(layer.weight), lowered(layer.bias))
-            else:
-                h = layer(h)
-        return h.to(x.dtype)
+        linear = [layer for layer in self if isinstance(layer, nn.Linear)]
+        layers = [(lowered(layer.weight), lowered(layer.bias)) for layer in linear]
+        rows = lowered(x).flatten(0, -2)
+        size = MLP_BLOCK if x.device.type == "cpu" else len(rows)
+        blocks = [_through(block, layers) for block in torch.split(rows, size)]
+        out = torch.cat(blocks) if len(blocks) > 1 else blocks[0]
+        return out.reshape(*x.shape[:-1], out.shape[-1]).to(x.dtype)
+
+
+def _through(h: Tensor, layers: Layers) -> Tensor:
+    """Outputs [n, out] of inputs [n, in]."""
+    *hidden, last = layers
+    for weight, bias in hidden:
+        h = torch.relu_(functional.linear(h, weight, bias))
+    return functional.linear(h, *last)
 
 
 def mlp(in_dim: int, hidden: tuple[int, ...], out_dim: int) -> MLP:
@@ -215,10 +229,6 @@ class Actor(nn.Module):
     def act(self, obs: Tensor, z: Tensor) -> Tensor:
         """Deterministic actions tanh(mean), [*, A]."""
         return torch.tanh(self(obs, z)[0])
-
-
-Layers = list[tuple[Tensor, Tensor]]
-"""Weight [heads, in, out] and bias [heads, 1, out] of each layer of a critic."""
 
 
 def frozen(layers: Layers) -> Layers:

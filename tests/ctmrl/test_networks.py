@@ -40,6 +40,20 @@ def test_mlp_has_relu_between_layers_and_none_at_the_end() -> None:
     assert (net(x) < 0).any()
 
 
+def test_an_mlp_gives_the_same_in_blocks_of_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    net, x = mlp(OBS, HIDDEN, ACT), normal(3, 5, OBS).float()
+    found = []
+    for block in (15, 4):
+        monkeypatch.setattr(networks, "MLP_BLOCK", block)
+        given = x.clone().requires_grad_()
+        net.zero_grad()
+        out = net(given)
+        out.square().sum().backward()
+        found.append([out, given.grad, *(parameter.grad for parameter in net.parameters())])
+    assert found[0][0].shape == (3, 5, ACT)
+    torch.testing.assert_close(found[0], found[1])
+
+
 def test_standardize_and_constant_columns() -> None:
     mean, std = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 0.0, 0.5])
     found = Standardize(mean, std)(torch.tensor([[3.0, 7.0, 3.0], [1.0, -7.0, 2.0]]))
