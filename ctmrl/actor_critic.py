@@ -54,8 +54,8 @@ class ActorCriticConfig:
     """Weight of minus the log likelihood of the data's actions in the policy's loss, in units of
     the spread of Q: what TD3+BC is for a deterministic policy. 0 is without it."""
     cloning_advantage: float = 0.0
-    """How much more actions count in cloning that are better than the policy's: by e to this many
-    times their advantage, in units of its spread. 0 clones all alike. Of no use without
+    """How much more actions count in cloning that are better than the value network's: by e to this
+    many times their advantage, in units of its spread. 0 clones all alike. Of no use without
     behavior_cloning."""
     value_expectile: float = 0.0
     """Above 0, the value network learns this expectile of Q at the data's own actions, as in IQL,

@@ -119,7 +119,7 @@ ROBOT: Settings = {
     "policy_episodes": 2,
 }
 LEGS = ROBOT | {"random_episodes": 10}
-# Of the policy's own actions, far from the data's, values mislead: IQL's do not.
+# docs/methods/actor_critic.md: with the value of the policy's own actions it stands still.
 ANT = ROBOT | {
     "steps": 15_000,
     "batch_size": 32,

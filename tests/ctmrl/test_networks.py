@@ -42,7 +42,13 @@ def test_mlp_has_relu_between_layers_and_none_at_the_end() -> None:
 
 def test_an_mlp_gives_the_same_in_blocks_of_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     net, x = mlp(OBS, HIDDEN, ACT), normal(3, 5, OBS).float()
-    found = []
+    found, sizes, through = [], [], networks._through
+
+    def watched(rows: Tensor, layers: networks.Layers) -> Tensor:
+        sizes.append(len(rows))
+        return through(rows, layers)
+
+    monkeypatch.setattr(networks, "_through", watched)
     for block in (15, 4):
         monkeypatch.setattr(networks, "MLP_BLOCK", block)
         given = x.clone().requires_grad_()
@@ -50,6 +56,7 @@ def test_an_mlp_gives_the_same_in_blocks_of_rows(monkeypatch: pytest.MonkeyPatch
         out = net(given)
         out.square().sum().backward()
         found.append([out, given.grad, *(parameter.grad for parameter in net.parameters())])
+    assert sizes == [15, 4, 4, 4, 3]
     assert found[0][0].shape == (3, 5, ACT)
     torch.testing.assert_close(found[0], found[1])
 

@@ -43,6 +43,12 @@ MOVE = (
 )
 
 
+@pytest.fixture(autouse=True)
+def blocks_of_500_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer than the contexts and the actor's batches have, so that all networks have blocks."""
+    monkeypatch.setattr(networks, "MLP_BLOCK", 500)
+
+
 @pytest.fixture(scope="module")
 def cheetah_data() -> OfflineData:
     """Random numbers in the shape of HalfCheetahVel's data."""

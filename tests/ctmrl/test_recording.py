@@ -37,9 +37,14 @@ every_case = pytest.mark.parametrize(("method", "precision"), CASES)
 
 
 def config(method: str, precision: str = "float32", decay: bool = False) -> RunConfig:
-    """With behaviour regularisation, and rates that float32 has exactly."""
+    """With behaviour regularisation, and rates that float32 has exactly.
+
+    `oracle_task` also clones and learns the value of the data's actions, as AntGoal's presets do.
+    """
     made = config_of(method, brac=True, precision=precision, steps=STEPS, decay=decay)
     rates: dict[str, Any] = {"learning_rate": 2.0**-10, "dual_lr": 2.0**-11}
+    if method == "oracle_task":
+        rates |= {"behavior_cloning": 5.0, "cloning_advantage": 3.0, "value_expectile": 0.8}
     return dataclasses.replace(
         made,
         context=dataclasses.replace(made.context, encoder_lr=2.0**-9),
