@@ -58,8 +58,8 @@ class ActorCriticConfig:
     many times their advantage, in units of its spread. 0 clones all alike. Of no use without
     behavior_cloning."""
     value_expectile: float = 0.0
-    """Above 0, the value network learns this expectile of Q at the data's own actions, as in IQL,
-    and so what the better of them are worth; 0 lets it learn the value of the policy."""
+    """Above 0, the value network learns this expectile of Q at the data's own actions, as in IQL:
+    above 0.5 what the better of them are worth; 0 lets it learn the value of the policy."""
     value_from_data: bool = False
     """Let critics and value network begin at the value that the data's mean reward comes to, and
     not at 0, from where they take thousands of steps."""

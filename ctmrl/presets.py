@@ -119,7 +119,8 @@ ROBOT: Settings = {
     "policy_episodes": 2,
 }
 LEGS = ROBOT | {"random_episodes": 10}
-# docs/methods/actor_critic.md: with the value of the policy's own actions it stands still.
+# With the value of the policy's own actions returns are those of standing still
+# (docs/methods/actor_critic.md).
 ANT = ROBOT | {
     "steps": 15_000,
     "batch_size": 32,
