@@ -1,4 +1,7 @@
-"""What a collection shows while it runs: bars on a terminal, a line a task elsewhere."""
+"""What a collection shows while it runs: bars on a terminal, lines elsewhere.
+
+The lines: one a task, and one every tenth of the training of a group of tasks.
+"""
 
 from __future__ import annotations
 
@@ -62,6 +65,10 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
+def _name(tasks: tuple[int, ...]) -> str:
+    return f"task {tasks[0]}" if len(tasks) == 1 else f"tasks {tasks[0]} to {tasks[-1]}"
+
+
 class CollectionDisplay:
     """Progress of a collection; a context manager."""
 
@@ -79,6 +86,7 @@ class CollectionDisplay:
         self._left = TimeLeft(jobs, budget)
         self._starts: dict[int, float] = {}
         self._bars: dict[int, TaskID] = {}
+        self._tenths: dict[int, int] = {}
         self._progress: Progress | None = None
         if console.is_terminal:
             self._progress = Progress(
@@ -114,9 +122,8 @@ class CollectionDisplay:
         for task in tasks:
             self._starts[task] = time.monotonic()
         if self._progress:
-            name = f"task {tasks[0]}" if len(tasks) == 1 else f"tasks {tasks[0]} to {tasks[-1]}"
             self._bars[tasks[0]] = self._progress.add_task(
-                name, total=self._budget.checkpoints[-1], note="starting"
+                _name(tasks), total=self._budget.checkpoints[-1], note="starting"
             )
 
     def step(self, tasks: tuple[int, ...], step: int) -> None:
@@ -129,6 +136,16 @@ class CollectionDisplay:
                 note = "rolling out"
             self._progress.update(self._bars[tasks[0]], completed=step, note=note)
             self._show_overall()
+        elif len(tasks) > 1:
+            self._print_tenth(tasks, step)
+
+    def _print_tenth(self, tasks: tuple[int, ...], step: int) -> None:
+        last = self._budget.checkpoints[-1]
+        tenth = 10 * step // last
+        if tenth > self._tenths.get(tasks[0], 0):
+            self._tenths[tasks[0]] = tenth
+            line = f"{_name(tasks)}: step {step} of {last}{self._rest()}"
+            self._console.print(line, soft_wrap=True, highlight=False)
 
     def trained(self, tasks: tuple[int, ...]) -> None:
         """A group is trained; its tasks are rolled out next, each alone."""

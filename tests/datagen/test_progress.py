@@ -89,6 +89,18 @@ def test_a_group_of_tasks_is_trained_first() -> None:
         assert f"task {task} ({count}/3): behaviour 31.50" in out.getvalue()
 
 
+def test_a_line_a_tenth_of_a_groups_training_off_the_terminal() -> None:
+    out, rows = io.StringIO(), budget("hopper_params", "smoke")
+    with CollectionDisplay(Console(file=out, width=40), 3, 3, rows) as display:
+        display.started((3, 4, 8))
+        for step in (20, 39, 40, 50, 290, 400):
+            display.step((3, 4, 8), step)
+    first, second, last = out.getvalue().splitlines()
+    assert first == "tasks 3 to 8: step 40 of 400", "random steps tell no time"
+    assert re.fullmatch(r"tasks 3 to 8: step 290 of 400, about \d+ s left", second)
+    assert re.fullmatch(r"tasks 3 to 8: step 400 of 400, about \d+ s left", last)
+
+
 def test_a_fleets_training_is_not_all_of_its_time() -> None:
     clock, rows = Clock(), budget("hopper_params", "smoke")
     left = TimeLeft(2, rows, clock)
