@@ -98,8 +98,8 @@ GOAL: Settings = {
     "hidden": (256, 256),
 }
 SQUARED: Settings = {"squared_errors": True}
-# Its return counts hundredths of the way, which take twice as many steps, at half the rate: at the
-# other robots' an actor in three was stuck.
+# Its return counts hundredths of the way, which take twice as many steps, at half the rate: at
+# PointRobot's, one actor of three was stuck (docs/decisions.md).
 SPARSE = GOAL | SQUARED | {"steps": 24_000, "learning_rate": 5e-4}
 # Sized for minutes of a small machine. docs/methods/actor_critic.md compares what holds a policy to
 # the data; the rest was not searched.
