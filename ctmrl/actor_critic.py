@@ -57,6 +57,10 @@ class ActorCriticConfig:
     """How much more actions count in cloning that are better than the value network's: by e to this
     many times their advantage, in units of its spread. 0 clones all alike. Of no use without
     behavior_cloning."""
+    cloning_rank: float = 0.0
+    """How much more actions count in cloning that are of better episodes: by e to this many times
+    the share of the task's data that are of episodes with lower returns. 0 clones all alike. Of no
+    use without behavior_cloning."""
     value_expectile: float = 0.0
     """Above 0, the value network learns this expectile of Q at the data's own actions, as in IQL:
     above 0.5 what the better of them are worth; 0 lets it learn the value of the policy."""
@@ -161,7 +165,8 @@ class ActorCritic(nn.Module):
         actor = actor + self.entropy_coef * self.config.regularizer * regularizer
         cloning = self.config.behavior_cloning
         if cloning:
-            weights = self.cloning_weights((at_data.amin(dim=0) - expected).detach())
+            advantage = (at_data.amin(dim=0) - expected).detach()
+            weights = self.cloning_weights(advantage, batch.rank)
             unlikely = -(weights * sample.log_prob_of(batch.action)).mean()
             actor = actor + cloning * q.detach().std() * unlikely
         metrics = {
@@ -187,17 +192,19 @@ class ActorCritic(nn.Module):
             metrics["divergence/coefficient"] = coefficient
         return critic + value + actor, metrics
 
-    def cloning_weights(self, advantage: Tensor) -> Tensor:
-        """Weights of a batch's actions in cloning, 1 on the mean; both [n].
+    def cloning_weights(self, advantage: Tensor, rank: Tensor) -> Tensor:
+        """Weights of a batch's actions in cloning, 1 on the mean; all [n].
 
-        They are advantage-weighted regression's (AWR and AWAC, where the spread is a temperature),
-        normalised over the batch, so that they hold the policy as firmly when all advantages fall.
+        By advantage they are advantage-weighted regression's (AWR and AWAC, where the spread is a
+        temperature), by rank those of reward-weighted regression, with an episode's place among
+        the task's in place of its return, which has other units in every task. They are normalised
+        over the batch, so that they hold the policy as firmly when all advantages fall.
         """
-        strength = self.config.cloning_advantage
-        if not strength:
+        better, returned = self.config.cloning_advantage, self.config.cloning_rank
+        if not better and not returned:
             return torch.ones_like(advantage)
         spread = advantage.std().clamp(min=1e-6)
-        return torch.softmax(strength * advantage / spread, dim=0) * len(advantage)
+        return torch.softmax(better * advantage / spread + returned * rank, dim=0) * len(advantage)
 
     def critic_target(self, batch: Transitions, z: Tensor) -> Tensor:
         """Targets y = r + gamma V_target(s', z), no value behind a terminal transition; [n]."""

@@ -131,7 +131,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("learning_rate", "encoder_lr", "dual_lr", "regularizer"), (0, math.inf)),
     **dict.fromkeys(("gamma", "target_rate", "eta", "warm_up", "refresh"), _SHARE),
     **dict.fromkeys(("reward_scale", "tau"), (1e-9, math.inf)),
-    **dict.fromkeys(("behavior_cloning", "cloning_advantage"), (0, math.inf)),
+    **dict.fromkeys(("behavior_cloning", "cloning_advantage", "cloning_rank"), (0, math.inf)),
     **dict.fromkeys((f"{name}_weight" for name in _WEIGHTS), (0, math.inf)),
     **dict.fromkeys(("divergence_initial", "divergence_maximum"), (0, math.inf)),
     "code_decay": _SHARE,

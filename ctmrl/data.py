@@ -27,6 +27,8 @@ class Transitions(NamedTuple):
         reward: [n], the dense one where an environment has both.
         next_obs: [n, O].
         terminal: [n], 1.0 where the value of next_obs does not count.
+        rank: [n], from 0 to below 1, the share of the task's rows that are of episodes with lower
+            returns than the row's own.
     """
 
     obs: Tensor
@@ -34,6 +36,7 @@ class Transitions(NamedTuple):
     reward: Tensor
     next_obs: Tensor
     terminal: Tensor
+    rank: Tensor
 
 
 @dataclass(frozen=True)
@@ -54,22 +57,22 @@ class _Layout:
 
     @property
     def width(self) -> int:
-        return self.context + 2
+        return self.context + 3
 
 
 class OfflineData:
-    """Transitions of T tasks in one float32 table: (s, a, r, s') for contexts, then (r, terminal).
+    """Transitions of T tasks in one float32 table: (s, a, r, s'), then (r, terminal, rank).
 
-    Tasks are counted 0..T-1 here, in the order they were given, and their rows follow each other in
-    that order: [T, row, feature] for tasks of any lengths. The table is the only copy, filled a
-    block of rows at a time.
+    The first part is for contexts. Tasks are counted 0..T-1 here, in the order they were given, and
+    their rows follow each other in that order: [T, row, feature] for tasks of any lengths. The
+    table is the only copy, filled a block of rows at a time.
 
     Attributes:
         tasks: int64 [T], the tasks' rows in the environment's task set.
         obs_dim: O.
         act_dim: A.
         params: float32 [T, P], the tasks' true parameters, which no method but a reference sees.
-        table: [N, 2 O + A + 3].
+        table: [N, 2 O + A + 4].
         device: where what is drawn lies, and the table too unless it is in a file.
         largest_reward: largest absolute reward the actor-critic learns from.
     """
@@ -125,6 +128,7 @@ class OfflineData:
         self._mean_reward, self._end_rate = map(
             float, (learned.reward.mean(), learned.terminal.mean())
         )
+        self.table[:, -1] = self._ranks(learned.reward).repeat_interleave(self._episode_rows)
         self._table.filled()
 
     def _fill(self, dataset: Dataset, rows_of: Callable[[TaskData], NDArray[np.float32]]) -> None:
@@ -132,7 +136,8 @@ class OfflineData:
         for task in self.tasks:
             for block in dataset.blocks(int(task)):
                 end = start + len(block)
-                self.table[start:end] = torch.from_numpy(rows_of(block))
+                # Without the rank, which is known when all is read.
+                self.table[start:end, :-1] = torch.from_numpy(rows_of(block))
                 start = end
 
     def _measure(self, next_obs_in_context: bool) -> Statistics:
@@ -147,6 +152,19 @@ class OfflineData:
             target=_moments(self.table[:, reward:context]),
             params=(self.params.mean(dim=0), spread),
         )
+
+    def _ranks(self, reward: Tensor) -> Tensor:
+        """The rank of each episode, from the rewards of all rows."""
+        returns = torch.segment_reduce(reward, "sum", lengths=self._episode_rows)
+        counts = self._task_episodes.tolist()
+        ranks = []
+        both = (torch.split(x, counts) for x in (returns, self._episode_rows))
+        for own, rows in zip(*both, strict=True):
+            ordered, order = own.sort()
+            below = rows[order].cumsum(0) - rows[order]
+            # Of episodes with one return, the first in order has all those below it.
+            ranks.append(below[torch.searchsorted(ordered, own)] / rows.sum())
+        return torch.cat(ranks)
 
     def __len__(self) -> int:
         """Number of tasks T."""
@@ -209,8 +227,9 @@ class OfflineData:
     def unpack(self, rows: Tensor) -> Transitions:
         """Split table rows [n, F] into a batch."""
         o, a = self.obs_dim, self.act_dim
-        obs, action, _, next_obs, reward, terminal = torch.split(rows, [o, a, 1, o, 1, 1], dim=-1)
-        return Transitions(obs, action, reward[:, 0], next_obs, terminal[:, 0])
+        obs, action, _, next_obs, last = torch.split(rows, [o, a, 1, o, 3], dim=-1)
+        reward, terminal, rank = last.unbind(dim=-1)
+        return Transitions(obs, action, reward, next_obs, terminal, rank)
 
     def check_episodes(self, sets: int, episodes: int) -> None:
         """Check that every task has the episodes that `contexts` needs.

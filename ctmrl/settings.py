@@ -12,6 +12,7 @@ LATER_SETTINGS: dict[str, Any] = {
     "actor_critic": {
         "behavior_cloning": 0.0,
         "cloning_advantage": 0.0,
+        "cloning_rank": 0.0,
         "value_expectile": 0.0,
         "value_from_data": False,
     },

@@ -75,7 +75,7 @@ def test_its_losses_stay_equal_to_ours(codebook: bool, monkeypatch: pytest.Monke
         chosen = plain.rng.permutation(len(tasks))[: config.training.meta_batch]
         contexts, batch = plain.sample_contexts(chosen), plain.sample_batch(chosen)
         monkeypatch.setattr(ours, "_draw", lambda *_, found=contexts: found)
-        given = Transitions(*batch)
+        given = Transitions(*batch, rank=torch.zeros(len(batch[0])))
         monkeypatch.setattr(ours.data, "transitions", lambda *_, found=given: found)
         # Ours draws tasks first; then both draw the same numbers in the same order.
         monkeypatch.setattr(torch, "randperm", lambda n, generator: torch.arange(n))

@@ -81,6 +81,7 @@ def batch(n: int = 19, seed: int = 0) -> Transitions:
         reward=torch.randn(n, generator=draw),
         next_obs=torch.randn(n, OBS, generator=draw),
         terminal=(torch.arange(n) % 3 == 0).float(),
+        rank=(torch.arange(n) % 5).float() / 5,
     )
 
 

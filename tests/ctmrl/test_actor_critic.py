@@ -131,12 +131,12 @@ def test_the_actors_and_the_value_networks_losses_are_the_fields_divided_by_r(br
     assert metrics["policy/entropy"].item() == pytest.approx(entropy, rel=1e-6)
 
 
-@pytest.mark.parametrize("strength", [0.0, 1.3])
+@pytest.mark.parametrize(("strength", "by_rank"), [(0.0, 0.0), (1.3, 0.0), (0.0, 2.1), (1.3, 2.1)])
 def test_behaviour_cloning_is_of_the_better_data_in_units_of_the_spread_of_q(
-    strength: float,
+    strength: float, by_rank: float
 ) -> None:
     plain = actor_critic()
-    cloning = actor_critic(behavior_cloning=0.7, cloning_advantage=strength)
+    cloning = actor_critic(behavior_cloning=0.7, cloning_advantage=strength, cloning_rank=by_rank)
     cloning.load_state_dict(plain.state_dict())
     rows, z = double_batch(), contexts()
     old = copy.deepcopy(cloning)
@@ -146,9 +146,9 @@ def test_behaviour_cloning_is_of_the_better_data_in_units_of_the_spread_of_q(
     policy = TransformedDistribution(Normal(mean, log_std.exp()), TanhTransform())
     with torch.no_grad():
         advantage = old.critic(rows.obs, rows.action, z).amin(dim=0) - old.value(rows.obs, z)[0]
-        weights = (strength * advantage / advantage.std()).exp()
+        weights = (strength * advantage / advantage.std()).exp() * (by_rank * rows.rank).exp()
         weights /= weights.mean()
-    assert strength == 0 or weights.max() > 1.5 * weights.min()
+    assert strength == by_rank == 0 or weights.max() > 1.5 * weights.min()
     log_prob = policy.log_prob(rows.action).sum(dim=1)  # type: ignore[no-untyped-call]
     unlikely = -(weights * log_prob).mean()
     sampled = old.actor.sample(rows.obs, z, generator(1)).action
@@ -305,7 +305,8 @@ def distance_from_behaviour(weight: float) -> float:
         # Behaviour near +0.5 on both axes; the reward prefers -1, and every row ends its episode.
         action = (0.5 + 0.2 * torch.randn(ROWS, ACT, generator=draw).double()).clamp(-0.95, 0.95)
         reward = -action.sum(dim=1)
-        rows = Transitions(obs, action, reward, obs, torch.ones(ROWS).double())
+        ones = torch.ones(ROWS).double()
+        rows = Transitions(obs, action, reward, obs, ones, ones)
         loss, _ = ac.loss(rows, z, draw)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]

@@ -61,6 +61,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("learning_rate", -1e-3, "at least 0"),
     ("behavior_cloning", -0.5, "at least 0"),
     ("cloning_advantage", -1.0, "at least 0"),
+    ("cloning_rank", -1.0, "at least 0"),
     ("value_expectile", 1.5, "from 0 to 1"),
     ("divergence_maximum", -1.0, "at least 0"),
     ("contrast_weight", -0.1, "at least 0"),

@@ -51,7 +51,8 @@ def test_each_task_has_its_own_parameters(data: OfflineData) -> None:
 def test_a_batch_is_of_the_right_tasks_in_order(data: OfflineData) -> None:
     tasks, n = torch.tensor([2, 0]), 13
     found = data.transitions(tasks, n, generator())
-    assert [tuple(part.shape) for part in found] == [(26, OBS), (26, ACT), (26,), (26, OBS), (26,)]
+    shapes = [(26, OBS), (26, ACT), (26,), (26, OBS), (26,), (26,)]
+    assert [tuple(part.shape) for part in found] == shapes
     assert found.obs[:, 0].tolist() == [5.0] * n + [7.0] * n
     # The actor-critic learns from the dense reward, which is minus the other one here.
     torch.testing.assert_close(found.reward, -wanted_reward(found.obs))
@@ -140,6 +141,27 @@ def test_the_mean_value_is_that_of_a_walk_that_ends_as_often_as_the_data(data: O
     alive = (1 - end) ** np.arange(2_000)
     wanted = reward * (0.97 ** np.arange(2_000) * alive).sum()
     assert data.mean_value(0.97) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_a_rows_rank_is_the_share_of_its_tasks_rows_in_episodes_of_lower_returns() -> None:
+    table = open_hand_made({7: (3, 11, 2, 5, 13), 2: (4, 4, 4)})
+    rows = table.unpack(table.table)
+    task, episode, _ = rows.obs.unbind(dim=1)
+    for k in range(len(task)):
+        own = task == task[k]
+        of_episode = {int(e): rows.reward[own & (episode == e)].sum() for e in episode[own]}
+        lower = [e for e, found in of_episode.items() if found < of_episode[int(episode[k])]]
+        count = sum(int((own & (episode == e)).sum()) for e in lower)
+        assert rows.rank[k].item() == pytest.approx(count / int(own.sum()))
+    assert sorted({*rows.rank[task == 2].tolist()}) == pytest.approx([0, 1 / 3, 2 / 3])
+
+
+def test_episodes_of_one_return_have_one_rank(data: OfflineData) -> None:
+    # The first task's episodes have 3, 11, 2, 5 and 13 rows.
+    reward = torch.zeros(len(data.table))
+    reward[:3], reward[3:14] = 2.0, 0.5
+    wanted = [31 / 34, 20 / 34, 0.0, 0.0, 0.0]
+    assert data._ranks(reward)[:5].tolist() == pytest.approx(wanted)
 
 
 def test_draws_depend_on_the_generator_alone(data: OfflineData) -> None:
@@ -267,7 +289,8 @@ def test_a_slice_is_all_that_is_learned_from(graded_path: Path) -> None:
     assert len(whole.table) == 3 * sum(lengths)
     for i in range(3):
         found, all_rows = (one.table[i * (len(one.table) // 3) :] for one in (data, whole))
-        assert found[: len(rows)].equal(all_rows[torch.from_numpy(rows)])
+        # But for the rank, which is among the slice's own episodes.
+        assert found[: len(rows), :-1].equal(all_rows[torch.from_numpy(rows), :-1])
     assert len(data.table) == 3 * len(rows)
     # Each episode is one of its own: six contexts, six different episodes.
     contexts = data.contexts(torch.arange(3), 6, 1, 400, generator())
