@@ -67,7 +67,11 @@ PAPER_ROBOT = PAPER | {
     "random_episodes": 2,
     "policy_episodes": 1,
 }
-PAPER_CHEETAH = PAPER_ROBOT | {"context_size": 100, "next_obs_in_context": False}
+PAPER_CHEETAH = PAPER_ROBOT | {
+    "context_size": 100,
+    "next_obs_in_context": False,
+    "club_weight": 10.0,
+}
 # A random hopper or walker is down after 9 steps.
 PAPER_LEGS = PAPER_ROBOT | {
     "context_size": 256,
@@ -78,6 +82,7 @@ PAPER_HUMANOID = PAPER_ROBOT | {
     "context_size": 256,
     "divergence_initial": 500.0,
     "next_obs_in_context": False,
+    "club_weight": 50.0,
 }
 PAPER_ANT = PAPER_HUMANOID | {
     "steps": 210_000,

@@ -17,6 +17,7 @@ from ctmrl.meta_test import MetaTestConfig
 from ctmrl.methods import METHODS
 from ctmrl.methods.base import Dimensions
 from ctmrl.methods.ctmrl import CTMRLConfig
+from ctmrl.methods.ctmrl_released import CTMRLReleasedConfig
 from ctmrl.presets import OF_METHODS, ROWS, SMOKE, config_from_settings, known_preset, preset
 from ctmrl.runs import to_json
 from datagen.budgets import budget
@@ -108,6 +109,17 @@ def test_the_fields_settings_for_robots() -> None:
         "walker_params": (4, 40, True, 105_000, 16, 256, 50, 10_000),
         "ant_goal": (2, 20, False, 210_000, 10, 512, 500, 2_000),
     }
+
+
+def test_the_fields_weights_of_club() -> None:
+    found = {}
+    for env in ROWS:
+        context = preset(env, "ctmrl_released", "paper").context
+        assert isinstance(context, CTMRLReleasedConfig)
+        found[env] = context.club_weight
+    others = {"half_cheetah_vel": 10, "half_cheetah_dir": 10}
+    others |= {"ant_goal": 50, "ant_dir": 50, "humanoid_dir": 50}
+    assert found == dict.fromkeys(ROWS, 25) | others
 
 
 def test_the_data_of_the_same_budget_are_enough(config: RunConfig) -> None:
