@@ -96,7 +96,7 @@ class _Adaptation:
 
     def read(self, context: Tensor) -> None:
         """Add transitions [n, T, F] of each task to its context."""
-        self.total += self.encoder.encode(context).double().sum(dim=1)
+        self.total += self.encoder(context).double().sum(dim=1)
         self.count += context.shape[1]
 
     @property
@@ -128,7 +128,7 @@ class _Adaptation:
             returns += np.where(running, seen.reward, 0.0)
             if explore:
                 rows = (obs, action, seen.read[:, None].astype(np.float32), seen.obs)
-                encoded = self.encoder.encode(torch.from_numpy(np.concatenate(rows, axis=1)))
+                encoded = self.encoder(torch.from_numpy(np.concatenate(rows, axis=1)))
                 keep = torch.from_numpy(running)[:, None]
                 self.total += torch.where(keep, encoded.double(), 0.0)
                 self.count += keep

@@ -15,6 +15,7 @@ from ctmrl.config import MetaTrainConfig, RunConfig
 from ctmrl.data import OfflineData
 from ctmrl.errors import UsageError
 from ctmrl.methods.base import Dimensions
+from ctmrl.networks import mean_encoding
 from ctmrl.numbers import Numbers, Source
 from ctmrl.precision import Precision, products_in
 from ctmrl.recording import Given, RecordedStep
@@ -125,8 +126,7 @@ class Learner:
     def all_contexts(self) -> Tensor:
         """One fresh context of every training task, [T, Z], without gradients."""
         with torch.no_grad():
-            z: Tensor = self.method.encoder(self._draw(self._every, 1))[0]
-            return z
+            return mean_encoding(self.method.encoder(self._draw(self._every, 1))[0])
 
     def _draw(self, tasks: Tensor, sets: int) -> Tensor:
         config = self.config
@@ -194,10 +194,11 @@ class Learner:
         """
         contexts, batch, params = given
         with products_in(self.precision):
-            z = self.method.encoder(contexts)
-            context_loss, metrics = self.method.context_loss(contexts, z, source)
-            # The first set's contexts, detached: the actor-critic must not train the encoder.
-            told = self.method.encoder.told(z[0].detach(), params)
+            encodings = self.method.encoder(contexts)
+            context_loss, metrics = self.method.context_loss(contexts, encodings, source)
+            # Detached: the actor-critic must not train the encoder. It has the first set's.
+            z = mean_encoding(encodings.detach())
+            told = self.method.encoder.told(z[0], params)
             repeated = told.repeat_interleave(self.config.batch_size, dim=0)
             policy_loss, more = self.actor_critic.loss(batch, repeated, source)
         drawn()
@@ -206,7 +207,7 @@ class Learner:
         loss.backward()  # type: ignore[no-untyped-call] # torch's own
         self.optimizers["main"].step()
         self.actor_critic.follow_value()
-        metrics |= _spread(z.detach()) | more
+        metrics |= _spread(z) | more
         data = {f"data/{name}": values for name, values in batch._asdict().items()}
         made = {"data/context": contexts, **data, "contexts": z, **metrics, "loss": loss}
         return metrics, made

@@ -114,12 +114,8 @@ class Encoder(nn.Module, ABC):
         self.z_dim, self.sees_dense_reward = z_dim, sees_dense_reward
 
     @abstractmethod
-    def encode(self, context: Tensor) -> Tensor:
-        """Encodings [*, n, Z] of context transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""
-
     def forward(self, context: Tensor) -> Tensor:
-        """Task-specific contexts c^spe = mean_t e(h^t): [*, n, F] -> [*, Z]."""
-        return self.encode(context).mean(dim=-2)
+        """Encodings e(h), [*, n, Z], of transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""
 
     def told(self, z: Tensor, params: Tensor) -> Tensor:
         """What the policy is told, [*, Z]: the contexts, unless this is a reference's encoder.
@@ -131,10 +127,15 @@ class Encoder(nn.Module, ABC):
         return z
 
 
+def mean_encoding(encodings: Tensor) -> Tensor:
+    """Task-specific contexts c^spe = mean_t e(h^t), [*, n, Z] -> [*, Z]."""
+    return encodings.mean(dim=-2)
+
+
 class BlindEncoder(Encoder):
     """Sees nothing: contexts are 0."""
 
-    def encode(self, context: Tensor) -> Tensor:
+    def forward(self, context: Tensor) -> Tensor:
         """Zeros [*, n, Z]."""
         return context.new_zeros(*context.shape[:-1], self.z_dim)
 
@@ -157,8 +158,8 @@ class ContextEncoder(Encoder):
         self.in_dim = len(statistics[0])
         self.net = mlp(self.in_dim, hidden, z_dim)
 
-    def encode(self, context: Tensor) -> Tensor:
-        """Encodings [*, n, Z] of context transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""
+    def forward(self, context: Tensor) -> Tensor:
+        """Encodings e(h), [*, n, Z], of transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""
         features = context[..., : self.in_dim]
         if self.in_dim == context.shape[-1]:
             # s' - s instead of s': what the dynamics did, on a scale of its own.

@@ -79,13 +79,14 @@ class Method(nn.Module, ABC):
 
     @abstractmethod
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: Source
+        self, contexts: Tensor, encodings: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss that trains the encoder.
 
         Args:
             contexts: [context_sets, B, n, O + A + 1 + O], transitions (s, a, r, s').
-            z: their task-specific contexts [context_sets, B, Z], with gradients.
+            encodings: of the transitions, [context_sets, B, n, Z], with gradients; their means are
+                the task-specific contexts.
             generator: of all draws.
 
         Returns:
@@ -123,7 +124,7 @@ class Reference(Method):
         """What stands in for contexts, without parameters to train."""
 
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: Source
+        self, contexts: Tensor, encodings: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """0, for there is nothing to train."""
         return torch.zeros((), device=contexts.device), {}

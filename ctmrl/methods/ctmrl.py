@@ -12,7 +12,7 @@ from ctmrl import cqvae
 from ctmrl.codebook import Codebook, check_codes, usage
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
-from ctmrl.networks import Predictors, Statistics
+from ctmrl.networks import Predictors, Statistics, mean_encoding
 from ctmrl.numbers import Source
 from ctmrl.schedule import COLLECTIONS, Schedule
 
@@ -101,11 +101,11 @@ class CTMRL(Method):
         return bool(self.codebook.placed)
 
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: Source
+        self, contexts: Tensor, encodings: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Equations (3) to (10); the codebook's terms are 0 until the warm-up is over."""
-        config, zero = self.config, torch.zeros((), device=z.device)
-        anchors, positives = z
+        config, zero = self.config, torch.zeros((), device=contexts.device)
+        anchors, positives = mean_encoding(encodings)
         tasks, n = contexts.shape[1:3]
         losses = {"spe_prediction": zero, "metric": zero}
         losses |= {"code_contrast": zero, "cro_prediction": zero, "contrast": zero}

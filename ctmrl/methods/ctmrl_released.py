@@ -14,7 +14,7 @@ from ctmrl.codebook import check_codes, usage
 from ctmrl.ema_codebook import EMACodebook
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
-from ctmrl.networks import Predictors, Statistics
+from ctmrl.networks import Predictors, Statistics, mean_encoding
 from ctmrl.numbers import Source
 from ctmrl.schedule import COLLECTIONS, Schedule
 
@@ -146,21 +146,20 @@ class CTMRLReleased(Method):
         return bool(self.codebook.placed)
 
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: Source
+        self, contexts: Tensor, encodings: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The sum of all terms; the codebook's are 0 until the warm-up is over.
 
         Objectives that the published code gives to separate optimisers share this sum: what must
         not train a network enters its term detached.
         """
-        config, zero = self.config, torch.zeros((), device=z.device)
-        anchors, positives = z
-        encodings = self.encoder.encode(contexts[0])
+        config, zero = self.config, torch.zeros((), device=contexts.device)
+        anchors, positives = mean_encoding(encodings)
         mean, variance = self.behavior_model(contexts[0][..., : self.dims.obs + self.dims.act])
         losses = {
             "metric": focal_metric_loss(anchors),
-            "club": club_loss(encodings, mean.detach(), variance.detach()),
-            "club_fit": likelihood_loss(encodings.detach(), mean, variance),
+            "club": club_loss(encodings[0], mean.detach(), variance.detach()),
+            "club_fit": likelihood_loss(encodings[0].detach(), mean, variance),
             "prediction": self._prediction_loss(contexts[0], anchors.detach()),
         }
         losses |= {"commitment": zero, "cycle": zero, "contrast": zero}
@@ -198,7 +197,7 @@ class CTMRLReleased(Method):
         standardized = self.predictors(obs, action, codes[:, None].expand(-1, context.shape[1], -1))
         outcome = self.predictors.standardize_target.inverse(torch.cat(standardized, dim=-1))
         predicted = torch.cat([obs, action, outcome[..., :1], obs + outcome[..., 1:]], dim=-1)
-        encodings: Tensor = self.encoder.encode(predicted)
+        encodings: Tensor = self.encoder(predicted)
         return encodings
 
     def code_of(self, z: Tensor) -> Tensor:

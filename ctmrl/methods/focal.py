@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ctmrl.methods.base import Dimensions, Method, MethodConfig
 from ctmrl.metric import focal_metric_loss
-from ctmrl.networks import Statistics
+from ctmrl.networks import Statistics, mean_encoding
 from ctmrl.numbers import Source
 
 
@@ -29,8 +29,8 @@ class FOCAL(Method):
         self.config = config
 
     def context_loss(
-        self, contexts: Tensor, z: Tensor, generator: Source
+        self, contexts: Tensor, encodings: Tensor, generator: Source
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted metric loss."""
-        metric = focal_metric_loss(z[0])
+        metric = focal_metric_loss(mean_encoding(encodings[0]))
         return self.config.metric_weight * metric, {"loss/encoder/metric": metric.detach()}

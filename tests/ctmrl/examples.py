@@ -101,9 +101,9 @@ def with_switches(method: CTMRL, **changes: Any) -> CTMRL:
     return twin
 
 
-def smoke(steps: int = 20, **changes: Any) -> RunConfig:
+def smoke(steps: int = 20, method: str = "ctmrl", **changes: Any) -> RunConfig:
     """The smoke preset on the robot in the wind."""
-    config = preset("point_robot_wind", "ctmrl", "smoke", **changes)
+    config = preset("point_robot_wind", method, "smoke", **changes)
     training: MetaTrainConfig = dataclasses.replace(config.training, steps=steps)
     return dataclasses.replace(config, training=training)
 

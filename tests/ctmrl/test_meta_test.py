@@ -28,9 +28,9 @@ class CountingEncoder(ContextEncoder):
         super().__init__((0.1 * ones, 0.5 * ones), 2, (11,), Z)
         self.given: list[Tensor] = []
 
-    def encode(self, context: Tensor) -> Tensor:
+    def forward(self, context: Tensor) -> Tensor:
         self.given.append(context.clone())
-        return super().encode(context)
+        return super().forward(context)
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ class Adaptation:
     def contexts(self) -> Tensor:
         """The mean over everything each environment has explored, 0 before that."""
         rows = [
-            self.encoder.encode(torch.stack(seen)).mean(dim=0) if seen else torch.zeros(Z)
+            self.encoder(torch.stack(seen)).mean(dim=0) if seen else torch.zeros(Z)
             for seen in self.transitions
         ]
         return torch.stack(rows)
@@ -182,7 +182,7 @@ def test_contexts_are_of_all_explored_transitions_random_ones_first(
     draw = torch.Generator().manual_seed(SEED)
     for episode in (2, 3, 4):
         with torch.no_grad():
-            z = ContextEncoder.encode(encoder, given[: 25 * episode]).mean(dim=0)
+            z = ContextEncoder.forward(encoder, given[: 25 * episode]).mean(dim=0)
             for step in range(25 * episode, 25 * episode + 25):
                 action = actor.sample(given[step, :, :2], z, draw).action
                 torch.testing.assert_close(given[step, :, 2:4], action, rtol=1e-4, atol=1e-5)

@@ -206,8 +206,8 @@ def test_a_weight_is_cast_once_for_a_call_and_critics_calls_share(
         elif "codebook" in name:
             wanted = 0
         elif method == "ctmrl_released" and ("encoder" in name or "predictors" in name):
-            # The encoder for the contexts, for CLUB and for the cycle, which predicts once more.
-            wanted = 3 if "encoder" in name else 2
+            # For the contexts and for the cycle, which predicts once more.
+            wanted = 2
         assert times == wanted, name
 
 

@@ -15,6 +15,7 @@ from ctmrl.codebook import Codebook, kmeans
 from ctmrl.errors import UsageError
 from ctmrl.methods.ctmrl import COLLECTIONS, CTMRL, CTMRLConfig
 from ctmrl.metric import focal_metric_loss
+from ctmrl.networks import mean_encoding
 from tests.ctmrl.examples import (
     ACT,
     BATCH,
@@ -74,7 +75,7 @@ def trained(gradients: dict[str, Tensor]) -> set[str]:
 def parts(method: CTMRL) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Contexts, anchors, positives, and the codes as they are when the losses are taken."""
     h = contexts().double()
-    anchors, positives = method.encoder(h)
+    anchors, positives = mean_encoding(method.encoder(h))
     codes = method.codebook.codes
     matched = cqvae.match(anchors, codes)
     moved = cqvae.moving_update(codes, anchors, matched, method.config.eta)
@@ -219,10 +220,11 @@ def test_before_the_warm_up_is_over_only_l_pre_spe_counts() -> None:
 def test_the_codes_move_once_a_step_by_equation_2() -> None:
     method = placed(eta=0.25)
     h = contexts().double()
-    z = method.encoder(h)
+    encodings = method.encoder(h)
+    z = mean_encoding(encodings)
     matched = cqvae.match(z[0], method.codebook.codes)
     wanted = cqvae.moving_update(method.codebook.codes, z[0], matched, 0.25).detach()
-    method.context_loss(h, z, generator())
+    method.context_loss(h, encodings, generator())
     torch.testing.assert_close(method.codebook.codes.detach(), wanted)
 
 

@@ -23,6 +23,7 @@ from ctmrl.methods.ctmrl_released import (
     commitment_loss,
     cycle_loss,
 )
+from ctmrl.networks import mean_encoding
 from ctmrl.presets import preset
 from ctmrl.schedule import COLLECTIONS
 from tests.ctmrl.examples import (
@@ -107,7 +108,7 @@ def unweighted(method: CTMRLReleased) -> Tensor:
     total = torch.zeros(())
     for i in range(BATCH):
         obs, action, reward, after = torch.split(h[i], [OBS, ACT, 1, OBS], dim=-1)
-        encodings = method.encoder.encode(h[i]).detach()
+        encodings = method.encoder(h[i]).detach()
         mean, variance = method.behavior_model(torch.cat([obs, action], dim=-1))
         fit = (encodings - mean) ** 2 / (2 * variance) + variance.sqrt().log()
         z = encodings.mean(dim=0).expand(LENGTH, Z)
@@ -122,7 +123,7 @@ def unweighted(method: CTMRLReleased) -> Tensor:
 def by_hand(method: CTMRLReleased, term: str) -> Tensor:
     """A term times its weight, by loops over tasks."""
     h = contexts().double()
-    z, other = method.encoder(h)
+    z, other = mean_encoding(method.encoder(h))
     matched = method.codebook.match(z)
     codes = method.codebook.codes
     total = torch.zeros(())
@@ -133,7 +134,7 @@ def by_hand(method: CTMRLReleased, term: str) -> Tensor:
         return 10 * total / (len(pairs) + 1e-3)
     if term == "club":
         for i in range(BATCH):
-            encodings = method.encoder.encode(h[0, i])
+            encodings = method.encoder(h[0, i])
             mean, variance = (x.detach() for x in method.behavior_model(h[0, i, :, : OBS + ACT]))
             pairs_error = (encodings[None] - mean[:, None]) ** 2 / variance[:, None]
             total = total + pairs_error.mean() - ((encodings - mean) ** 2 / variance).mean()
@@ -164,7 +165,7 @@ def by_hand_cycle(method: CTMRLReleased, h: Tensor, codes: Tensor) -> Tensor:
         reward = mean[0] + std[0] * reward
         after = obs + mean[1:] + std[1:] * change
         predicted = torch.cat([obs, action, reward, after], dim=-1)
-        total = total + ((codes[i] - method.encoder.encode(predicted)) ** 2).mean()
+        total = total + ((codes[i] - method.encoder(predicted)) ** 2).mean()
     return total / BATCH
 
 
@@ -204,7 +205,7 @@ def test_the_loss_is_the_sum_of_all_terms() -> None:
         *usage(torch.zeros(1, dtype=torch.int64), CODES),
     }
     method = placed()
-    matched = method.codebook.match(method.encoder(contexts().double())[0])
+    matched = method.codebook.match(mean_encoding(method.encoder(contexts().double())[0]))
     assert metrics["codes/perplexity"] == perplexity(matched, CODES)
 
 
@@ -235,10 +236,11 @@ def test_before_the_warm_up_is_over_the_codebook_has_no_say() -> None:
 @pytest.mark.parametrize("decay", [0.9, 0.9**4])
 def test_the_codes_move_once_a_step_after_the_losses_saw_them(decay: float) -> None:
     method, h = placed(code_decay=decay), contexts().double()
-    z = method.encoder(h)
+    encodings = method.encoder(h)
+    z = mean_encoding(encodings)
     codes, matched = method.codebook.codes.clone(), method.codebook.match(z[0])
     twin = copy.deepcopy(method.codebook)
-    _, metrics = method.context_loss(h, z, generator())
+    _, metrics = method.context_loss(h, encodings, generator())
     twin.update(z[0].detach(), matched, decay)
     assert not twin.codes.equal(codes)
     assert method.codebook.codes.equal(twin.codes)

@@ -17,9 +17,9 @@ def focal(weight: float = 10.0) -> FOCAL:
 @pytest.mark.parametrize("weight", [10.0, 3.0])
 def test_the_loss(weight: float) -> None:
     method, h = focal(weight), contexts(1)
-    z = method.encoder(h)
-    loss, metrics = method.context_loss(h, z, generator())
-    wanted = focal_metric_loss(z[0]).item()
+    encodings = method.encoder(h)
+    loss, metrics = method.context_loss(h, encodings, generator())
+    wanted = focal_metric_loss(encodings[0].mean(dim=1)).item()
     assert loss.item() == pytest.approx(weight * wanted, rel=1e-6)
     assert metrics == {"loss/encoder/metric": pytest.approx(wanted, rel=1e-6)}
 
