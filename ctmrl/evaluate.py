@@ -31,7 +31,8 @@ class EvaluateConfig:
     """Contexts of the tasks' own offline data in place of exploration: what the field calls the
     offline protocol. The dataset must have the test tasks."""
     data: Path | None = None
-    """Dataset folder for --offline; default datasets/<environment>."""
+    """Dataset folder for --offline, of the data that the run learned from; default
+    datasets/<environment>."""
     seed: int | None = None
     """Of exploration or of the offline contexts, and of the fresh tasks; the run's own seed by
     default."""
@@ -177,6 +178,7 @@ def main(config: EvaluateConfig) -> None:
         dims = Dimensions(*(stored["dimensions"][name] for name in Dimensions._fields))
         groups = {name: np.array(rows) for name, rows in stored["groups"].items()}
         best = {int(task): value for task, value in stored["best_behavior"].items()}
+        learned_from = str(stored["dataset"])
     settle_threads(run_config.threads)
     state = runs.load_checkpoint(config.run / runs.CHECKPOINT)
     with runs.fitting(config.run / runs.CHECKPOINT):
@@ -191,7 +193,7 @@ def main(config: EvaluateConfig) -> None:
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
-    given = offline_contexts(run_config, groups, seed) if config.offline else None
+    given = offline_contexts(run_config, groups, seed, learned_from) if config.offline else None
     record = evaluate_agent(agent, run_config, tasks, groups, best, seed, given)
     console = Console()
     if step < dims.steps:
