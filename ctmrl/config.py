@@ -143,6 +143,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "workers": (1, math.inf),
 }
 """Least and largest value of the options that have them."""
+_UNLIMITED = {"memory"}
+"""Options that may be infinite."""
 
 
 def check_settings(config: Any) -> None:
@@ -158,10 +160,18 @@ def check_settings(config: Any) -> None:
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             check_settings(value)
-        elif field.name in _BOUNDS and value is not None:
-            low, high = _BOUNDS[field.name]
-            numbers = value if isinstance(value, tuple) else (value,)
-            if not all(low <= number <= high for number in numbers):
-                wanted = f"at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
-                option = field.name.replace("_", "-")
-                raise UsageError(f"--{option} must be {wanted}, got {value}")
+        elif value is not None and (wanted := _wanted(field.name, value)):
+            option = field.name.replace("_", "-")
+            raise UsageError(f"--{option} must be {wanted}, got {value}")
+
+
+def _wanted(name: str, value: Any) -> str | None:
+    """What an option has to be, None where its value is that."""
+    numbers = value if isinstance(value, tuple) else (value,)
+    if name in _BOUNDS:
+        low, high = _BOUNDS[name]
+        if not all(low <= number <= high for number in numbers):
+            return f"at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
+    if name in _UNLIMITED or all(math.isfinite(one) for one in numbers if isinstance(one, float)):
+        return None
+    return "a finite number"

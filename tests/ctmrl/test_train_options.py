@@ -92,6 +92,7 @@ def mistake(
         ),
         (("--steps", "0"), "--steps must be at least 1, got 0"),
         (("--tau", "nan"), "--tau must be at least 1e-09, got nan"),
+        (("--divergence-target", "nan"), "--divergence-target must be a finite number, got nan"),
         (("--memory", "-1"), "--memory must be at least 0, got -1.0"),
         (("--seed", "-1"), "--seed must be from 0 to 9.22337e+18, got -1"),
     ],
