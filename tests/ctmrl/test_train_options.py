@@ -94,6 +94,7 @@ def mistake(
         (("--tau", "nan"), "--tau must be at least 1e-09, got nan"),
         (("--divergence-target", "nan"), "--divergence-target must be a finite number, got nan"),
         (("--memory", "-1"), "--memory must be at least 0, got -1.0"),
+        (("--threads", "100000"), "--threads must be from 1 to 1024, got 100000"),
         (("--seed", "-1"), "--seed must be from 0 to 9.22337e+18, got -1"),
     ],
 )
