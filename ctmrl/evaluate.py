@@ -152,6 +152,16 @@ def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
     return dataclasses.replace(run, data=config.data)
 
 
+def _groups(stored: dict[str, Any], tasks: TaskSet) -> dict[str, NDArray[np.int64]]:
+    """The groups of a run's config.json; a KeyError, TypeError or ValueError if they cannot be."""
+    import numpy as np
+
+    for name, rows in stored["groups"].items():
+        if not rows or not all(isinstance(row, int) and 0 <= row < len(tasks) for row in rows):
+            raise ValueError(f"groups.{name} is not of tasks from 0 to {len(tasks) - 1}")
+    return {name: np.array(rows) for name, rows in stored["groups"].items()}
+
+
 def main(config: EvaluateConfig) -> None:
     """Evaluate and print."""
     import dataclasses
@@ -173,11 +183,12 @@ def main(config: EvaluateConfig) -> None:
     stored = runs.read_json(config.run / runs.CONFIG)
     run_config = _settings(config, config_from_settings(stored, config.run / runs.CONFIG))
     seed = run_config.seed if config.seed is None else config.seed
+    tasks = task_set(run_config.env)
     with runs.fitting(config.run / runs.CONFIG):
         check_settings(dataclasses.replace(run_config, seed=seed))
-        dims = Dimensions(*(stored["dimensions"][name] for name in Dimensions._fields))
-        groups = {name: np.array(rows) for name, rows in stored["groups"].items()}
-        best = {int(task): value for task, value in stored["best_behavior"].items()}
+        dims = Dimensions(*(int(stored["dimensions"][name]) for name in Dimensions._fields))
+        groups = _groups(stored, tasks)
+        best = {int(task): float(value) for task, value in stored["best_behavior"].items()}
         learned_from = str(stored["dataset"])
     settle_threads(run_config.threads)
     state = runs.load_checkpoint(config.run / runs.CHECKPOINT)
@@ -189,7 +200,6 @@ def main(config: EvaluateConfig) -> None:
             f"{config.run} stopped at step {step} of {dims.steps}: "
             "give its training command again to finish it, or --unfinished to score it as it is"
         )
-    tasks = task_set(run_config.env)
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}

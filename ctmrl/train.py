@@ -313,6 +313,7 @@ def main() -> None:
     """Train and print the result."""
     from rich.console import Console
 
+    from ctmrl import runs
     from ctmrl.report import result_table
     from ctmrl.seeds import train_seeds
 
@@ -323,8 +324,10 @@ def main() -> None:
         folder = config.out or default_folder(config).parent
         sys.exit(train_seeds(train, config, folder, console))
     record = train(config, console)
-    console.print(result_table(record))
     path = config.out or default_folder(config)
+    with runs.fitting(path / runs.EVALUATION):
+        table = result_table(record)
+    console.print(table)
     console.print(f"Pictures, metrics and checkpoint: {path}", soft_wrap=True)
 
 

@@ -239,6 +239,28 @@ def test_a_config_of_another_version(
     assert mistake(capsys, copy).startswith(f"{copy / 'config.json'} does not fit ")
 
 
+@pytest.mark.parametrize(
+    ("key", "wrong", "why"),
+    [
+        ("best_behavior", {"x": 1}, "invalid literal for int() with base 10: 'x'"),
+        ("best_behavior", {"1": "x"}, "could not convert string to float: 'x'"),
+        ("groups", {"unseen": [2], "seen": [999]}, "groups.seen is not of tasks from 0 to 49"),
+        ("groups", {"unseen": [-1]}, "groups.unseen is not of tasks from 0 to 49"),
+        ("groups", {"unseen": [0.5]}, "groups.unseen is not of tasks from 0 to 49"),
+        ("groups", {"unseen": []}, "groups.unseen is not of tasks from 0 to 49"),
+        ("dimensions", {"obs": 2, "act": 2, "tasks": 7, "steps": "x"}, "invalid literal for int()"),
+    ],
+)
+def test_a_damaged_config(
+    key: str, wrong: Any, why: str, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored = read_json(copy / "config.json")
+    (copy / "config.json").write_text(json.dumps({**stored, key: wrong}))
+    said = mistake(capsys, copy)
+    assert said.startswith(f"{copy / 'config.json'} does not fit its run ({why}")
+    assert said.endswith("): train again with --restart")
+
+
 def test_a_setting_of_a_wrong_type(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stored = read_json(copy / "config.json")
     stored["settings"]["training"]["steps"] = "many"

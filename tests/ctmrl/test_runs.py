@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from ctmrl import runs
+from ctmrl.errors import UsageError
 from ctmrl.runs import RunError, RunFolder
 from tests.ctmrl.commands import Commands, contents
 
@@ -259,11 +260,18 @@ def test_a_missing_file_is_one_sentence(path: Path) -> None:
 
 
 def test_what_does_not_fit_is_one_sentence() -> None:
-    for error in (KeyError("step"), RuntimeError("size mismatch\nfor x"), TypeError("no")):
+    for error in (
+        KeyError("step"),
+        RuntimeError("size mismatch\nfor x"),
+        TypeError("no"),
+        ValueError(),
+    ):
         with pytest.raises(RunError) as caught, runs.fitting(Path("checkpoint.pt")):
             raise error
         assert str(caught.value).startswith("checkpoint.pt does not fit its run (")
         assert "\n" not in str(caught.value)
+    with pytest.raises(UsageError, match=r"^mine$"), runs.fitting(Path("checkpoint.pt")):
+        raise UsageError("mine")
     with pytest.raises(ZeroDivisionError), runs.fitting(Path("checkpoint.pt")):
         raise ZeroDivisionError
 

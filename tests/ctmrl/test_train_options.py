@@ -21,6 +21,7 @@ from ctmrl.train import parse
 from datagen.dataset import task_file
 from meta_envs import ENVIRONMENTS
 from tests.ctmrl.commands import Commands
+from tests.ctmrl.conftest import FinishedRun
 from tests.datagen.examples import write_dataset
 
 
@@ -157,6 +158,19 @@ def test_a_folder_of_something_else_is_left_alone(mistake: Any, tmp_path: Path) 
     (tmp_path / "out" / "thesis.tex").write_text("x")
     for words in ((), ("--restart",)):
         assert mistake(*words) == "out holds files that are not of a run: choose another --out"
+
+
+@pytest.mark.parametrize("content", ["{}", '{"groups": [1]}'])
+def test_a_damaged_evaluation_is_one_sentence(
+    content: str, finished_run: FinishedRun, commands: Commands, tmp_path: Path
+) -> None:
+    path = shutil.copytree(finished_run.path, tmp_path / "copy")
+    (path / "evaluation.json").write_text(content)
+    assert commands.run(*finished_run.words, "--out", str(path)) == 2
+    said = commands.output().splitlines()[-1]
+    assert said.startswith(f"error: {path / 'evaluation.json'} does not fit its run (")
+    assert said.endswith("): train again with --restart")
+    assert "Traceback" not in commands.output()
 
 
 @pytest.mark.parametrize(
