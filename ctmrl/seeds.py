@@ -29,6 +29,7 @@ from ctmrl.config import RunConfig
 from ctmrl.console import MISTAKES
 from ctmrl.errors import UsageError
 from ctmrl.report import print_report
+from ctmrl.runs import CONFIG
 from ctmrl.summary import find_records
 from ctmrl.table import SHARE, available_memory
 
@@ -74,7 +75,15 @@ def plan(config: RunConfig, folder: Path) -> tuple[list[RunConfig], int]:
     """The run of each of the config's seeds, in a folder below `folder`; how many at a time.
 
     Each run's `workers` is that number, for the cores that it leaves to the others.
+
+    Raises:
+        UsageError: the folder is a run's own.
     """
+    if (folder / CONFIG).exists():
+        raise UsageError(
+            f"{folder} is the folder of one run, and --seeds makes a folder for each below it: "
+            "choose another --out"
+        )
     workers = min(config.workers or max(cores() // config.threads, 1), len(config.seeds))
     memory = config.memory
     if memory is None:

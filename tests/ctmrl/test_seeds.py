@@ -147,6 +147,17 @@ def test_mistakes_all_seeds_share_are_one_sentence(
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_runs_own_folder_is_none_of_seeds(finished_run: FinishedRun, commands: Commands) -> None:
+    before = contents(finished_run.path)
+    words = (*finished_run.words, "--seeds", "0", "1", "--out", str(finished_run.path))
+    assert commands.run(*words) == 2
+    assert commands.output() == (
+        f"error: {finished_run.path} is the folder of one run, and --seeds makes a folder for each "
+        "below it: choose another --out\n"
+    )
+    assert contents(finished_run.path) == before
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
