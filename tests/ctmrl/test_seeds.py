@@ -220,6 +220,23 @@ def test_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert plan(dataclasses.replace(config, workers=3), tmp_path)[1] == 3
 
 
+def test_seeds_that_begin_have_one_best_precision(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(seeds, "best_precision", lambda device: "bfloat16")
+    (tmp_path / "seed-5").mkdir()
+    (tmp_path / "seed-5" / "config.json").write_text("{}")
+    config = dataclasses.replace(smoke(), seeds=(7, 5, 3), precision="auto")
+
+    def precisions(config: RunConfig) -> list[str]:
+        return [run.precision for run in plan(config, tmp_path)[0]]
+
+    # What the other has begun with is in its folder.
+    assert precisions(config) == ["bfloat16", "auto", "bfloat16"]
+    assert precisions(dataclasses.replace(config, restart=True)) == ["bfloat16"] * 3
+    assert precisions(dataclasses.replace(config, precision="float32")) == ["float32"] * 3
+
+
 def test_cores() -> None:
     assert 1 <= seeds.cores() <= (os.cpu_count() or 1)
 
