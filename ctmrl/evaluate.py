@@ -129,6 +129,25 @@ def _check_out(config: EvaluateConfig) -> None:
         raise UsageError(f"--out {config.out} is {whose}: choose another folder")
 
 
+def _make_out(out: Path) -> None:
+    """Make the output folder, and be sure that files can be written there.
+
+    Raises:
+        UsageError: they cannot.
+    """
+    import tempfile
+
+    from ctmrl.errors import UsageError
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()
+    except OSError as error:
+        raise UsageError(
+            f"--out {out} cannot be written to ({error.strerror}): choose another folder"
+        ) from None
+
+
 def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
     """The run's settings, with what the evaluation has of its own.
 
@@ -204,6 +223,8 @@ def main(config: EvaluateConfig) -> None:
         tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
     given = offline_contexts(run_config, groups, seed, learned_from) if config.offline else None
+    if config.out is not None:
+        _make_out(config.out)
     record = evaluate_agent(agent, run_config, tasks, groups, best, seed, given)
     console = Console()
     if step < dims.steps:
@@ -211,7 +232,6 @@ def main(config: EvaluateConfig) -> None:
         console.print(f"The checkpoint of step {step} of {dims.steps}.")
     console.print(result_table(record))
     if config.out is not None:
-        config.out.mkdir(parents=True, exist_ok=True)
         write_whole(config.out / runs.EVALUATION, runs.to_json(record))
         write_pictures(record, config.out)
 
