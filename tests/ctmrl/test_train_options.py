@@ -17,6 +17,7 @@ from ctmrl.methods import METHODS
 from ctmrl.methods.ctmrl import CTMRLConfig
 from ctmrl.methods.focal import FOCALConfig
 from ctmrl.presets import preset
+from ctmrl.runs import RunFolder, read_json
 from ctmrl.train import parse
 from datagen.dataset import task_file
 from meta_envs import ENVIRONMENTS
@@ -158,6 +159,25 @@ def test_a_folder_of_something_else_is_left_alone(mistake: Any, tmp_path: Path) 
     (tmp_path / "out" / "thesis.tex").write_text("x")
     for words in ((), ("--restart",)):
         assert mistake(*words) == "out holds files that are not of a run: choose another --out"
+
+
+def test_a_folder_is_refused_before_the_data_are_read(
+    mistake: Any, finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ctmrl.data.OfflineData", None)
+    path = shutil.copytree(finished_run.path, tmp_path / "out")
+    said = "out holds a run with settings.training.steps = 40, this one has 60: "
+    assert mistake().startswith(said)
+    folder = RunFolder(path, read_json(path / "config.json"), restart=False)
+    assert mistake("--steps", "40") == "another process is at work in out: wait for it"
+    folder.close()
+    (path / "thesis.tex").write_text("x")
+    assert mistake("--restart").startswith("out also holds thesis.tex, which is not of a run: ")
+    # A finished run is shown without them too.
+    (path / "thesis.tex").unlink()
+    words = (*finished_run.words[1:], "--out", str(path))
+    monkeypatch.setattr(sys, "argv", ["train", *words])
+    assert run_command(command.main) == 0
 
 
 @pytest.mark.parametrize("content", ["{}", '{"groups": [1]}'])
