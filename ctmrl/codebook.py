@@ -42,9 +42,11 @@ def kmeans(contexts: Tensor, n_codes: int, seed: int) -> Tensor:
     # Imported here: it takes a second, and only runs that use K-means need it.
     from sklearn.cluster import KMeans
     from sklearn.exceptions import ConvergenceWarning
+    from threadpoolctl import threadpool_limits
 
     directions = functional.normalize(contexts, dim=1, eps=1e-6).cpu().numpy().astype(np.float64)
-    with warnings.catch_warnings():
+    # It would take all cores: torch's threads are not those of its libraries.
+    with warnings.catch_warnings(), threadpool_limits(1):
         # Fewer distinct contexts than codes: the surplus centres repeat others, which is right.
         warnings.simplefilter("ignore", ConvergenceWarning)
         labels = KMeans(n_codes, n_init=4, random_state=seed).fit_predict(directions)

@@ -125,7 +125,9 @@ _WEIGHTS = (
 )
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("steps", "batch_size", "context_episodes", "context_size"), (1, math.inf)),
-    **dict.fromkeys(("scored_episodes", "repetitions", "threads", "z_dim"), (1, math.inf)),
+    **dict.fromkeys(("scored_episodes", "repetitions", "z_dim"), (1, math.inf)),
+    # Far more of them, and the libraries crash.
+    "threads": (1, 1024),
     **dict.fromkeys(("hidden", "encoder_hidden", "predictor_hidden"), (1, math.inf)),
     **dict.fromkeys(("random_episodes", "policy_episodes", "extra_negatives"), (0, math.inf)),
     **dict.fromkeys(("learning_rate", "encoder_lr", "dual_lr", "regularizer"), (0, math.inf)),
@@ -143,6 +145,8 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "workers": (1, math.inf),
 }
 """Least and largest value of the options that have them."""
+_UNLIMITED = {"memory"}
+"""Options that may be infinite."""
 
 
 def check_settings(config: Any) -> None:
@@ -158,10 +162,18 @@ def check_settings(config: Any) -> None:
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             check_settings(value)
-        elif field.name in _BOUNDS and value is not None:
-            low, high = _BOUNDS[field.name]
-            numbers = value if isinstance(value, tuple) else (value,)
-            if not all(low <= number <= high for number in numbers):
-                wanted = f"at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
-                option = field.name.replace("_", "-")
-                raise UsageError(f"--{option} must be {wanted}, got {value}")
+        elif value is not None and (wanted := _wanted(field.name, value)):
+            option = field.name.replace("_", "-")
+            raise UsageError(f"--{option} must be {wanted}, got {value}")
+
+
+def _wanted(name: str, value: Any) -> str | None:
+    """What an option has to be, None where its value is that."""
+    numbers = value if isinstance(value, tuple) else (value,)
+    if name in _BOUNDS:
+        low, high = _BOUNDS[name]
+        if not all(low <= number <= high for number in numbers):
+            return f"at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
+    if name in _UNLIMITED or all(math.isfinite(one) for one in numbers if isinstance(one, float)):
+        return None
+    return "a finite number"

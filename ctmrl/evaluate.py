@@ -31,7 +31,8 @@ class EvaluateConfig:
     """Contexts of the tasks' own offline data in place of exploration: what the field calls the
     offline protocol. The dataset must have the test tasks."""
     data: Path | None = None
-    """Dataset folder for --offline; default datasets/<environment>."""
+    """Dataset folder for --offline, of the data that the run learned from; default
+    datasets/<environment>."""
     seed: int | None = None
     """Of exploration or of the offline contexts, and of the fresh tasks; the run's own seed by
     default."""
@@ -128,6 +129,25 @@ def _check_out(config: EvaluateConfig) -> None:
         raise UsageError(f"--out {config.out} is {whose}: choose another folder")
 
 
+def _make_out(out: Path) -> None:
+    """Make the output folder, and be sure that files can be written there.
+
+    Raises:
+        UsageError: they cannot.
+    """
+    import tempfile
+
+    from ctmrl.errors import UsageError
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()
+    except OSError as error:
+        raise UsageError(
+            f"--out {out} cannot be written to ({error.strerror}): choose another folder"
+        ) from None
+
+
 def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
     """The run's settings, with what the evaluation has of its own.
 
@@ -151,6 +171,16 @@ def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
     return dataclasses.replace(run, data=config.data)
 
 
+def _groups(stored: dict[str, Any], tasks: TaskSet) -> dict[str, NDArray[np.int64]]:
+    """The groups of a run's config.json; a KeyError, TypeError or ValueError if they cannot be."""
+    import numpy as np
+
+    for name, rows in stored["groups"].items():
+        if not rows or not all(isinstance(row, int) and 0 <= row < len(tasks) for row in rows):
+            raise ValueError(f"groups.{name} is not of tasks from 0 to {len(tasks) - 1}")
+    return {name: np.array(rows) for name, rows in stored["groups"].items()}
+
+
 def main(config: EvaluateConfig) -> None:
     """Evaluate and print."""
     import dataclasses
@@ -172,11 +202,13 @@ def main(config: EvaluateConfig) -> None:
     stored = runs.read_json(config.run / runs.CONFIG)
     run_config = _settings(config, config_from_settings(stored, config.run / runs.CONFIG))
     seed = run_config.seed if config.seed is None else config.seed
+    tasks = task_set(run_config.env)
     with runs.fitting(config.run / runs.CONFIG):
         check_settings(dataclasses.replace(run_config, seed=seed))
-        dims = Dimensions(*(stored["dimensions"][name] for name in Dimensions._fields))
-        groups = {name: np.array(rows) for name, rows in stored["groups"].items()}
-        best = {int(task): value for task, value in stored["best_behavior"].items()}
+        dims = Dimensions(*(int(stored["dimensions"][name]) for name in Dimensions._fields))
+        groups = _groups(stored, tasks)
+        best = {int(task): float(value) for task, value in stored["best_behavior"].items()}
+        learned_from = str(stored["dataset"])
     settle_threads(run_config.threads)
     state = runs.load_checkpoint(config.run / runs.CHECKPOINT)
     with runs.fitting(config.run / runs.CHECKPOINT):
@@ -187,11 +219,12 @@ def main(config: EvaluateConfig) -> None:
             f"{config.run} stopped at step {step} of {dims.steps}: "
             "give its training command again to finish it, or --unfinished to score it as it is"
         )
-    tasks = task_set(run_config.env)
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
-    given = offline_contexts(run_config, groups, seed) if config.offline else None
+    given = offline_contexts(run_config, groups, seed, learned_from) if config.offline else None
+    if config.out is not None:
+        _make_out(config.out)
     record = evaluate_agent(agent, run_config, tasks, groups, best, seed, given)
     console = Console()
     if step < dims.steps:
@@ -199,7 +232,6 @@ def main(config: EvaluateConfig) -> None:
         console.print(f"The checkpoint of step {step} of {dims.steps}.")
     console.print(result_table(record))
     if config.out is not None:
-        config.out.mkdir(parents=True, exist_ok=True)
         write_whole(config.out / runs.EVALUATION, runs.to_json(record))
         write_pictures(record, config.out)
 

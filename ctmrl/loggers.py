@@ -200,4 +200,6 @@ def _run_id(path: Path) -> str:
     """The id in a run's file, drawn and written there the first time."""
     if not path.exists():
         write_whole(path, runs.to_json({"id": secrets.token_hex(4)}))
-    return str(runs.read_json(path)["id"])
+    with runs.fitting(path):
+        found = str(runs.read_json(path)["id"])
+    return found

@@ -39,7 +39,10 @@ def open_data(config: RunConfig) -> Dataset:
 
 
 def offline_contexts(
-    config: RunConfig, groups: Mapping[str, NDArray[np.int64]], seed: int
+    config: RunConfig,
+    groups: Mapping[str, NDArray[np.int64]],
+    seed: int,
+    learned_from: str | None = None,
 ) -> dict[str, Tensor]:
     """Contexts of the tasks' own data, drawn as in meta-training.
 
@@ -47,22 +50,29 @@ def offline_contexts(
         config: of the run; its dataset, slice and sizes of contexts are in it.
         groups: tasks by the groups' names.
         seed: of the draws, in each group anew.
+        learned_from: hash of the dataset that it must be, if any will not do.
 
     Returns:
         Transitions [R * n, T, O + A + 1 + O] by group, repetition by repetition.
 
     Raises:
-        UsageError: the dataset lacks a task or has too few episodes.
+        UsageError: it is another dataset, lacks a task or has too few episodes.
         DatasetError: it is missing or damaged.
     """
     dataset, found = open_data(config), {}
+    if learned_from not in (None, dataset.hash):
+        raise UsageError(
+            f"{dataset.path} does not hold the data that the run learned from: "
+            "give --data with the folder that does"
+        )
     training = config.training
     for name, rows in groups.items():
         if missing := sorted({*rows.tolist()} - {*dataset.tasks.tolist()}):
             raise UsageError(
                 f"--offline needs data of the {name} tasks, and {dataset.path} has none of "
                 f"{', '.join(map(str, missing))}: python -m datagen.collect --env {config.env} "
-                f"--out {dataset.path}, with its --budget and --seed, collects all tasks"
+                f"--out {dataset.path}, with its --budget and --seed, collects all tasks, "
+                "for a new run to learn from"
             )
         data = OfflineData(dataset, rows, dense_context=config.context.dense_reward_in_context)
         draws = torch.Generator().manual_seed(seed)

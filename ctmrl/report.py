@@ -17,6 +17,7 @@ import tyro
 from numpy.typing import NDArray
 from rich.table import Table
 
+from ctmrl.errors import UsageError
 from ctmrl.summary import (
     Result,
     collate,
@@ -269,12 +270,23 @@ def main(config: ReportConfig) -> None:
     """Read the runs and print."""
     from rich.console import Console
 
+    if config.csv is not None and config.csv.is_dir():
+        raise UsageError(f"--csv {config.csv} is a folder: give the name of a file")
     results = print_report(find_records(config.runs), Console())
     if config.csv is not None:
-        config.csv.parent.mkdir(parents=True, exist_ok=True)
-        from datagen.dataset import write_whole
+        _write_csv(config.csv, to_csv(results))
 
-        write_whole(config.csv, to_csv(results).encode())
+
+def _write_csv(path: Path, text: str) -> None:
+    from datagen.dataset import write_whole
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, text.encode())
+    except OSError as error:
+        raise UsageError(
+            f"--csv {path} cannot be written ({error.strerror}): choose another file"
+        ) from None
 
 
 if __name__ == "__main__":

@@ -98,8 +98,10 @@ def fitting(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
+    except UsageError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise RunError(
             f"{path} does not fit its run ({reason}): train again with --restart"
         ) from None
@@ -114,6 +116,84 @@ def begun_with(path: Path, name: str) -> Any:
     config = path / CONFIG
     settings = read_json(config).get("settings") if config.exists() else None
     return with_later_settings(settings).get(name) if isinstance(settings, dict) else None
+
+
+def check_folder(path: Path, known: dict[str, Any], restart: bool) -> bool:
+    """Refuse a folder that `RunFolder` would, before the data are read for it; changes nothing.
+
+    Args:
+        path: the folder, if it is there.
+        known: the settings, but for top-level entries that are not known yet.
+        restart: throw away the run that is there.
+
+    Returns:
+        Whether it holds the run, finished.
+
+    Raises:
+        RunError: the folder holds a run with other settings, something that is not a run, or a run
+            at work.
+    """
+    if not path.exists():
+        return False
+    lock = _locked(path)
+    try:
+        if not (path / CONFIG).exists():
+            _refuse_others_files(path)
+            return False
+        if restart:
+            _refuse_to_throw_away(path)
+            return False
+        there = read_json(path / CONFIG)
+        _compare(path, {key: there[key] for key in known.keys() & there.keys()}, known)
+        return (path / EVALUATION).exists()
+    finally:
+        os.close(lock)
+
+
+def _locked(path: Path) -> int:
+    """A handle of a folder, which is locked until it is closed."""
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise RunError(f"{path} cannot be written to ({error.strerror}): try --out") from None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise RunError(f"another process is at work in {path}: wait for it") from None
+    return handle
+
+
+def _entries(path: Path) -> set[str]:
+    """Names of all that is in a folder, but for what a process is writing."""
+    names = (entry.name for entry in path.iterdir())
+    return {name for name in names if not name.endswith(".partial")}
+
+
+def _refuse_others_files(path: Path) -> None:
+    if _entries(path):
+        raise RunError(f"{path} holds files that are not of a run: choose another --out")
+
+
+def _refuse_to_throw_away(path: Path) -> None:
+    foreign = sorted(_entries(path) - set(RUN_FILES))
+    if foreign:
+        raise RunError(
+            f"{path} also holds {foreign[0]}, which is not of a run: "
+            "choose another --out, or move it away"
+        )
+
+
+def _compare(path: Path, there: dict[str, Any], asked: dict[str, Any]) -> None:
+    # Through JSON, because a tuple comes back as a list.
+    unsaid = flatten({"settings": LATER_SETTINGS})
+    flat, wanted = (unsaid | flatten(one) for one in (there, json.loads(to_json(asked))))
+    for key in sorted(flat.keys() | wanted.keys()):
+        if flat.get(key) != wanted.get(key):
+            raise RunError(
+                f"{path} holds a run with {key} = {flat.get(key)}, this one has "
+                f"{wanted.get(key)}: choose another --out, or --restart to throw it away"
+            )
 
 
 class RunFolder:
@@ -138,9 +218,9 @@ class RunFolder:
         self.path = path
         try:
             path.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(path, os.O_RDONLY)
         except OSError as error:
             raise RunError(f"{path} cannot be written to ({error.strerror}): try --out") from None
+        self._lock = _locked(path)
         try:
             self._begin(settings, restart)
         except BaseException:
@@ -148,10 +228,6 @@ class RunFolder:
             raise
 
     def _begin(self, settings: dict[str, Any], restart: bool) -> None:
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunError(f"another process is at work in {self.path}: wait for it") from None
         # The lock is ours, so whatever others were writing here will never be finished.
         for left in (one for name in RUN_FILES for one in self.path.glob(f".{name}.*.partial")):
             if f".{os.getpid()}." not in left.name:
@@ -160,44 +236,22 @@ class RunFolder:
         if restart and config.exists():
             self._throw_away()
         if config.exists():
-            self._compare(read_json(config), settings)
-        elif self._entries():
-            raise RunError(f"{self.path} holds files that are not of a run: choose another --out")
+            _compare(self.path, read_json(config), settings)
         else:
+            _refuse_others_files(self.path)
             write_whole(config, to_json(settings))
 
     def close(self) -> None:
         """Let others use the folder."""
         os.close(self._lock)
 
-    def _entries(self) -> set[str]:
-        """Names of all that is there, but for what this process is writing."""
-        names = (entry.name for entry in self.path.iterdir())
-        return {name for name in names if not name.endswith(".partial")}
-
     def _throw_away(self) -> None:
-        foreign = sorted(self._entries() - set(RUN_FILES))
-        if foreign:
-            raise RunError(
-                f"{self.path} also holds {foreign[0]}, which is not of a run: "
-                "choose another --out, or move it away"
-            )
+        _refuse_to_throw_away(self.path)
         for entry in (self.path / name for name in RUN_FILES):
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry)
             else:
                 entry.unlink(missing_ok=True)
-
-    def _compare(self, there: dict[str, Any], asked: dict[str, Any]) -> None:
-        # Through JSON, because a tuple comes back as a list.
-        unsaid = flatten({"settings": LATER_SETTINGS})
-        flat, wanted = (unsaid | flatten(one) for one in (there, json.loads(to_json(asked))))
-        for key in sorted(flat.keys() | wanted.keys()):
-            if flat.get(key) != wanted.get(key):
-                raise RunError(
-                    f"{self.path} holds a run with {key} = {flat.get(key)}, this one has "
-                    f"{wanted.get(key)}: choose another --out, or --restart to throw it away"
-                )
 
     @property
     def finished(self) -> bool:

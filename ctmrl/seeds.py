@@ -29,8 +29,10 @@ from ctmrl.config import RunConfig
 from ctmrl.console import MISTAKES
 from ctmrl.errors import UsageError
 from ctmrl.report import print_report
+from ctmrl.runs import CONFIG
 from ctmrl.summary import find_records
 from ctmrl.table import SHARE, available_memory
+from datagen.accelerator import best_precision
 
 Watch = Callable[[Mapping[str, float | None]], None]
 """Is shown each row of metrics."""
@@ -74,7 +76,15 @@ def plan(config: RunConfig, folder: Path) -> tuple[list[RunConfig], int]:
     """The run of each of the config's seeds, in a folder below `folder`; how many at a time.
 
     Each run's `workers` is that number, for the cores that it leaves to the others.
+
+    Raises:
+        UsageError: the folder is a run's own.
     """
+    if (folder / CONFIG).exists():
+        raise UsageError(
+            f"{folder} is the folder of one run, and --seeds makes a folder for each below it: "
+            "choose another --out"
+        )
     workers = min(config.workers or max(cores() // config.threads, 1), len(config.seeds))
     memory = config.memory
     if memory is None:
@@ -85,7 +95,19 @@ def plan(config: RunConfig, folder: Path) -> tuple[list[RunConfig], int]:
         )
         for seed in config.seeds
     ]
-    return runs, workers
+    return [_with_precision(run) for run in runs], workers
+
+
+def _with_precision(run: RunConfig) -> RunConfig:
+    """A run that begins with this machine's best precision in place of "auto".
+
+    The processor is timed for it here, once and before the seeds keep it busy, so that all of them
+    have the same. A run that has begun finds its own in its folder.
+    """
+    begun = run.out and (run.out / CONFIG).exists() and not run.restart
+    if run.precision != "auto" or begun:
+        return run
+    return dataclasses.replace(run, precision=best_precision(run.device))
 
 
 def cores() -> int:

@@ -27,8 +27,8 @@ SHARE = 0.5
 READERS = 8
 """Threads that wait for the disk: so many reads are on their way at once."""
 MEMINFO = Path("/proc/meminfo")
-LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""Linux's account of its memory, and a container's share of it."""
+GROUP = Path("/sys/fs/cgroup")
+"""Linux's account of its memory, and the folder of a container's."""
 
 
 def available_memory() -> int:
@@ -39,9 +39,20 @@ def available_memory() -> int:
     except (OSError, KeyError, ValueError):
         available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
-        return min(available, int(LIMIT.read_text()))
+        limit = int((GROUP / "memory.max").read_text())
     except (OSError, ValueError):
         return available
+    return min(available, max(limit - _taken(), 0))
+
+
+def _taken() -> int:
+    """Bytes of memory that a container holds and cannot give away; 0 if unknown."""
+    try:
+        fields = dict(line.split() for line in (GROUP / "memory.stat").read_text().splitlines())
+        # Of the copies of files, those it has not read lately are given away first.
+        return int((GROUP / "memory.current").read_text()) - int(fields.get("inactive_file", 0))
+    except (OSError, ValueError):
+        return 0
 
 
 @dataclass(frozen=True)

@@ -68,22 +68,27 @@ def best_behavior(dataset: Dataset) -> dict[int, float]:
     }
 
 
-def settings_of(
-    config: RunConfig, dataset: Dataset, split: Split, learner: Learner
-) -> dict[str, Any]:
-    """What config.json holds: all that decides the run's results."""
+def known_settings(config: RunConfig, dataset: Dataset, split: Split) -> dict[str, Any]:
+    """What of config.json is known before the data are read."""
     from ctmrl.settings import without_later_settings
 
     # Of a device such as cuda:1, what decides the bytes.
-    every = {**dataclasses.asdict(config), "device": learner.device.type}.items()
+    every = {**dataclasses.asdict(config), "device": config.device.partition(":")[0]}.items()
     return {
         "settings": without_later_settings({k: v for k, v in every if k not in NOT_SETTINGS}),
         "dataset": dataset.hash,
         "groups": {"unseen": split.unseen.tolist(), "seen": split.train.tolist()},
         "best_behavior": {str(task): value for task, value in best_behavior(dataset).items()},
-        "dimensions": learner.method.dims._asdict(),
         "versions": {name: metadata.version(name) for name in PACKAGES},
     }
+
+
+def settings_of(
+    config: RunConfig, dataset: Dataset, split: Split, learner: Learner
+) -> dict[str, Any]:
+    """What config.json holds: all that decides the run's results."""
+    known = known_settings(config, dataset, split)
+    return {**known, "dimensions": learner.method.dims._asdict()}
 
 
 def check(config: RunConfig) -> Dataset:
@@ -130,6 +135,8 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
     split = split_tasks(dataset, config.validate)
     path = config.out or default_folder(config)
     config = with_precision(config, path)
+    if runs.check_folder(path, known_settings(config, dataset, split), config.restart):
+        return _finished(path, console)
     data = OfflineData(
         dataset,
         split.train,
@@ -142,9 +149,7 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
     folder = runs.RunFolder(path, settings, config.restart)
     try:
         if folder.finished:
-            done = f"{path} is finished; --restart trains it anew, --seed n another."
-            console.print(done, soft_wrap=True)
-            return runs.read_json(path / runs.EVALUATION)
+            return _finished(path, console)
         if data.in_file:
             console.print("The training data are read from a file; more --memory avoids it.")
         try:
@@ -154,6 +159,15 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
         return _evaluate(config, learner, folder, split, best_behavior(dataset))
     finally:
         folder.close()
+
+
+def _finished(path: Path, console: Console) -> dict[str, Any]:
+    """The evaluation of a run that is finished."""
+    from ctmrl import runs
+
+    done = f"{path} is finished; --restart trains it anew, --seed n another."
+    console.print(done, soft_wrap=True)
+    return runs.read_json(path / runs.EVALUATION)
 
 
 def with_precision(config: RunConfig, path: Path) -> RunConfig:
@@ -313,6 +327,7 @@ def main() -> None:
     """Train and print the result."""
     from rich.console import Console
 
+    from ctmrl import runs
     from ctmrl.report import result_table
     from ctmrl.seeds import train_seeds
 
@@ -323,8 +338,10 @@ def main() -> None:
         folder = config.out or default_folder(config).parent
         sys.exit(train_seeds(train, config, folder, console))
     record = train(config, console)
-    console.print(result_table(record))
     path = config.out or default_folder(config)
+    with runs.fitting(path / runs.EVALUATION):
+        table = result_table(record)
+    console.print(table)
     console.print(f"Pictures, metrics and checkpoint: {path}", soft_wrap=True)
 
 

@@ -28,8 +28,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "ctmrl": {
         "ctmrl", "datagen.accelerator", "datagen.dataset", "meta_envs", "matplotlib", "numpy",
-        "PIL", "safetensors", "scipy", "sklearn", "tensorboard", "torch", "trackio", "wandb",
-        *COMMAND_LINE,
+        "PIL", "safetensors", "scipy", "sklearn", "tensorboard", "threadpoolctl", "torch",
+        "trackio", "wandb", *COMMAND_LINE,
     },
 }  # fmt: skip
 """What a module may import beside the standard library; its longest matching prefix counts."""

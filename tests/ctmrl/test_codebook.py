@@ -7,6 +7,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from sklearn.cluster import KMeans
+from threadpoolctl import threadpool_info, threadpool_limits
 from torch import Tensor
 from torch.nn import functional
 
@@ -44,6 +47,23 @@ def test_kmeans_clusters_by_direction_and_not_by_length() -> None:
     found = kmeans(points, 2, 0)
     order = found[:, 1].argsort()
     np.testing.assert_allclose(found[order], torch.stack([5.01 * a, 5.01 * b]), atol=1e-4)
+
+
+def test_kmeans_takes_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit_predict = KMeans.fit_predict
+    seen: list[int] = []
+
+    def watched(model: KMeans, points: NDArray[np.float64]) -> NDArray[np.int32]:
+        seen.extend(pool["num_threads"] for pool in threadpool_info())
+        found: NDArray[np.int32] = fit_predict(model, points)
+        return found
+
+    monkeypatch.setattr(KMeans, "fit_predict", watched)
+    with threadpool_limits(3):
+        before = threadpool_info()
+        kmeans(normal(89, Z).float(), CODES, 0)
+        assert threadpool_info() == before
+    assert {*seen} == {1}
 
 
 def test_kmeans_is_repeatable() -> None:

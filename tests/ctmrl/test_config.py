@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 from typing import Any
 
 import pytest
@@ -47,7 +48,8 @@ def test_presets_pass_the_check(method: str) -> None:
 WRONG: list[tuple[str, Any, str]] = [
     ("seed", -1, "from 0 to 9.22337e+18"),
     ("seed", 2**64, "from 0 to 9.22337e+18"),
-    ("threads", 0, "at least 1"),
+    ("threads", 0, "from 1 to 1024"),
+    ("threads", 100_000, "from 1 to 1024"),
     ("data_episodes", 0, "at least 1"),
     ("steps", 0, "at least 1"),
     ("meta_batch", 1, "at least 2"),
@@ -59,6 +61,9 @@ WRONG: list[tuple[str, Any, str]] = [
     ("gamma", float("nan"), "from 0 to 1"),
     ("reward_scale", 0.0, "at least 1e-09"),
     ("learning_rate", -1e-3, "at least 0"),
+    ("learning_rate", math.inf, "a finite number"),
+    ("divergence_target", math.nan, "a finite number"),
+    ("divergence_target", -math.inf, "a finite number"),
     ("behavior_cloning", -0.5, "at least 0"),
     ("cloning_advantage", -1.0, "at least 0"),
     ("cloning_rank", -1.0, "at least 0"),
@@ -91,6 +96,17 @@ def test_a_value_out_of_its_range_is_one_sentence(name: str, value: Any, wanted:
     with pytest.raises(UsageError) as caught:
         check_settings(config)
     assert str(caught.value) == f"--{option} must be {wanted}, got {value}"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_option_but_memory_may_be_infinite(method: str) -> None:
+    config = preset("point_robot", method, "standard")
+    check_settings(dataclasses.replace(config, memory=math.inf))
+    for part in parts(config):
+        for field in dataclasses.fields(part):
+            if isinstance(getattr(part, field.name), float):
+                with pytest.raises(UsageError, match=f"--{field.name.replace('_', '-')} must be "):
+                    check_settings(dataclasses.replace(part, **{field.name: math.inf}))
 
 
 @pytest.mark.parametrize(

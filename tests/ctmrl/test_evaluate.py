@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import tyro
 
 from ctmrl.agent import Agent, load_agent
 from ctmrl.console import run_command
@@ -239,6 +238,28 @@ def test_a_config_of_another_version(
     assert mistake(capsys, copy).startswith(f"{copy / 'config.json'} does not fit ")
 
 
+@pytest.mark.parametrize(
+    ("key", "wrong", "why"),
+    [
+        ("best_behavior", {"x": 1}, "invalid literal for int() with base 10: 'x'"),
+        ("best_behavior", {"1": "x"}, "could not convert string to float: 'x'"),
+        ("groups", {"unseen": [2], "seen": [999]}, "groups.seen is not of tasks from 0 to 49"),
+        ("groups", {"unseen": [-1]}, "groups.unseen is not of tasks from 0 to 49"),
+        ("groups", {"unseen": [0.5]}, "groups.unseen is not of tasks from 0 to 49"),
+        ("groups", {"unseen": []}, "groups.unseen is not of tasks from 0 to 49"),
+        ("dimensions", {"obs": 2, "act": 2, "tasks": 7, "steps": "x"}, "invalid literal for int()"),
+    ],
+)
+def test_a_damaged_config(
+    key: str, wrong: Any, why: str, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stored = read_json(copy / "config.json")
+    (copy / "config.json").write_text(json.dumps({**stored, key: wrong}))
+    said = mistake(capsys, copy)
+    assert said.startswith(f"{copy / 'config.json'} does not fit its run ({why}")
+    assert said.endswith("): train again with --restart")
+
+
 def test_a_setting_of_a_wrong_type(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     stored = read_json(copy / "config.json")
     stored["settings"]["training"]["steps"] = "many"
@@ -247,15 +268,20 @@ def test_a_setting_of_a_wrong_type(copy: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_an_output_folder_that_is_a_file(
-    finished_run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished_run: FinishedRun,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    # It is told before anything is computed.
+    monkeypatch.setattr("ctmrl.evaluate.evaluate_agent", None)
     (tmp_path / "out").write_text("")
-    command = tyro.cli(
-        EvaluateConfig,
-        args=[str(finished_run.path), "--fresh", "1", "--out", str(tmp_path / "out")],
-    )
-    assert run_command(lambda: main(command)) == 2
-    assert capsys.readouterr().err.startswith("error: [Errno 17] File exists: ")
+    for out, why in (
+        (tmp_path / "out", "File exists"),
+        (tmp_path / "out" / "x", "Not a directory"),
+    ):
+        said = mistake(capsys, finished_run.path, fresh=1, out=out)
+        assert said == f"--out {out} cannot be written to ({why}): choose another folder"
 
 
 def test_the_runs_own_folder_as_output(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -187,6 +187,15 @@ def test_a_run_trained_anew_has_another_id(folder: Path, monkeypatch: pytest.Mon
     assert len(ids) == 2
 
 
+def test_an_id_that_is_not_there_is_one_sentence(folder: Path) -> None:
+    (folder / "loggers.json").write_text("{}")
+    with pytest.raises(UsageError) as caught:
+        log_one(("tensorboard",), folder, 0)
+    assert str(caught.value) == (
+        f"{folder / 'loggers.json'} does not fit its run ('id'): train again with --restart"
+    )
+
+
 def test_tensorboard_itself(folder: Path) -> None:
     accumulator = pytest.importorskip(
         "tensorboard.backend.event_processing.event_accumulator"

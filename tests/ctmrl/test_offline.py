@@ -99,6 +99,17 @@ def test_tasks_without_data_are_named(config: RunConfig, good_path: Path) -> Non
         offline_contexts(config, GROUPS, seed=0)
 
 
+def test_other_data_than_the_run_learned_from_are_refused(
+    finished_run: FinishedRun, good_path: Path, commands: Commands
+) -> None:
+    words = ("ctmrl.evaluate", str(finished_run.path), "--offline", "--data", str(good_path))
+    assert commands.run(*words) == 2
+    assert commands.output() == (
+        f"error: {good_path} does not hold the data that the run learned from: "
+        "give --data with the folder that does\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

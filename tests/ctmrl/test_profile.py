@@ -178,7 +178,7 @@ def test_random_numbers_are_enough_for_the_contexts(
     ("options", "sentence"),
     [
         (ProfileConfig(steps=0), "--steps must be at least 1, got 0"),
-        (ProfileConfig(threads=0), "--threads must be at least 1, got 0"),
+        (ProfileConfig(threads=0), "--threads must be from 1 to 1024, got 0"),
         (ProfileConfig(env="windy"), "no environment 'windy'"),
         (ProfileConfig(method="ctrml"), "did you mean 'ctmrl'?"),
         (ProfileConfig(preset="big"), "no preset 'big'"),

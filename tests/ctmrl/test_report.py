@@ -276,6 +276,22 @@ def test_a_folder_without_runs_is_one_sentence(
     )
 
 
+def test_a_csv_that_cannot_be_written_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_records(tmp_path / "runs")
+    (tmp_path / "file").write_text("")
+    assert run_command(lambda: main(ReportConfig([tmp_path / "runs"], tmp_path))) == 2
+    captured = capsys.readouterr()
+    assert captured.err == f"error: --csv {tmp_path} is a folder: give the name of a file\n"
+    assert captured.out == ""
+    below = tmp_path / "file" / "table.csv"
+    assert run_command(lambda: main(ReportConfig([tmp_path / "runs"], below))) == 2
+    assert capsys.readouterr().err == (
+        f"error: --csv {below} cannot be written (File exists): choose another file\n"
+    )
+
+
 def test_a_report_needs_no_torch() -> None:
     code = "import sys, ctmrl.report; print({'torch', 'matplotlib', 'gymnasium'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -16,7 +16,8 @@ import pytest
 import torch
 
 from ctmrl import runs
-from ctmrl.runs import RunError, RunFolder
+from ctmrl.errors import UsageError
+from ctmrl.runs import RunError, RunFolder, check_folder
 from tests.ctmrl.commands import Commands, contents
 
 SETTINGS: dict[str, Any] = {
@@ -166,6 +167,41 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == [".thesis.tex.1.partial", "thesis.tex"]
 
 
+def test_what_is_refused_is_refused_before_the_settings_are_complete(
+    path: Path, tmp_path: Path
+) -> None:
+    known = {"settings": SETTINGS["settings"]}
+    assert not check_folder(path, known, restart=False)
+    assert not path.parent.exists()
+    with opened(path) as folder:
+        with pytest.raises(RunError, match="another process is at work"):
+            check_folder(path, known, restart=False)
+        folder.save_checkpoint(STATE)
+    assert not check_folder(path, known, restart=False)
+    (path / "evaluation.json").write_text("{}")
+    before = contents(path)
+    assert check_folder(path, known, restart=False)
+    other = {"settings": changed(seed=3)["settings"]}
+    with pytest.raises(RunError, match=r"holds a run with settings.seed = 0, this one has 3: "):
+        check_folder(path, other, restart=False)
+    assert not check_folder(path, other, restart=True)
+    assert contents(path) == before
+    (path / "thesis.tex").write_text("x")
+    with pytest.raises(RunError, match=r"also holds thesis\.tex, which is not of a run"):
+        check_folder(path, known, restart=True)
+    (path / "config.json").unlink()
+    with pytest.raises(RunError, match="holds files that are not of a run"):
+        check_folder(path, known, restart=False)
+    with pytest.raises(RunError, match=r"tex cannot be written to \(.*\): try --out$"):
+        check_folder(path / "thesis.tex", known, restart=False)
+    # Nothing is kept locked.
+    (path / "thesis.tex").unlink()
+    (path / "evaluation.json").unlink()
+    (path / "checkpoint.pt").unlink()
+    with opened(path):
+        pass
+
+
 def test_what_a_kill_left_before_the_first_file_is_no_obstacle(path: Path) -> None:
     path.mkdir(parents=True)
     (path / ".config.json.1.partial").write_bytes(b'{"sett')
@@ -259,11 +295,18 @@ def test_a_missing_file_is_one_sentence(path: Path) -> None:
 
 
 def test_what_does_not_fit_is_one_sentence() -> None:
-    for error in (KeyError("step"), RuntimeError("size mismatch\nfor x"), TypeError("no")):
+    for error in (
+        KeyError("step"),
+        RuntimeError("size mismatch\nfor x"),
+        TypeError("no"),
+        ValueError(),
+    ):
         with pytest.raises(RunError) as caught, runs.fitting(Path("checkpoint.pt")):
             raise error
         assert str(caught.value).startswith("checkpoint.pt does not fit its run (")
         assert "\n" not in str(caught.value)
+    with pytest.raises(UsageError, match=r"^mine$"), runs.fitting(Path("checkpoint.pt")):
+        raise UsageError("mine")
     with pytest.raises(ZeroDivisionError), runs.fitting(Path("checkpoint.pt")):
         raise ZeroDivisionError
 

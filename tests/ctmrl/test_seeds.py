@@ -147,6 +147,17 @@ def test_mistakes_all_seeds_share_are_one_sentence(
     assert not (tmp_path / "runs").exists()
 
 
+def test_a_runs_own_folder_is_none_of_seeds(finished_run: FinishedRun, commands: Commands) -> None:
+    before = contents(finished_run.path)
+    words = (*finished_run.words, "--seeds", "0", "1", "--out", str(finished_run.path))
+    assert commands.run(*words) == 2
+    assert commands.output() == (
+        f"error: {finished_run.path} is the folder of one run, and --seeds makes a folder for each "
+        "below it: choose another --out\n"
+    )
+    assert contents(finished_run.path) == before
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -207,6 +218,23 @@ def test_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert (workers, {run.memory for run in runs}) == (3, {1.5})
     assert plan(dataclasses.replace(config, threads=9), tmp_path)[1] == 1
     assert plan(dataclasses.replace(config, workers=3), tmp_path)[1] == 3
+
+
+def test_seeds_that_begin_have_one_best_precision(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(seeds, "best_precision", lambda device: "bfloat16")
+    (tmp_path / "seed-5").mkdir()
+    (tmp_path / "seed-5" / "config.json").write_text("{}")
+    config = dataclasses.replace(smoke(), seeds=(7, 5, 3), precision="auto")
+
+    def precisions(config: RunConfig) -> list[str]:
+        return [run.precision for run in plan(config, tmp_path)[0]]
+
+    # What the other has begun with is in its folder.
+    assert precisions(config) == ["bfloat16", "auto", "bfloat16"]
+    assert precisions(dataclasses.replace(config, restart=True)) == ["bfloat16"] * 3
+    assert precisions(dataclasses.replace(config, precision="float32")) == ["float32"] * 3
 
 
 def test_cores() -> None:

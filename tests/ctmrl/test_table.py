@@ -18,11 +18,12 @@ from ctmrl.table import READERS, Room, available_memory
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> tuple[Path, Path]:
     """A machine with 4,000,000 bytes available, in a container without a limit."""
-    meminfo, limit = tmp_path / "meminfo", tmp_path / "memory.max"
+    meminfo, limit = tmp_path / "meminfo", tmp_path / "group" / "memory.max"
+    limit.parent.mkdir()
     meminfo.write_text("MemTotal:  9000 kB\nMemAvailable:    3906 kB\nHugePages_Total:  0\n")
     limit.write_text("max\n")
     monkeypatch.setattr(table, "MEMINFO", meminfo)
-    monkeypatch.setattr(table, "LIMIT", limit)
+    monkeypatch.setattr(table, "GROUP", limit.parent)
     return meminfo, limit
 
 
@@ -39,6 +40,27 @@ def test_the_memory_that_is_available(machine: tuple[Path, Path]) -> None:
         assert available_memory() == everything
     meminfo.unlink()
     assert available_memory() == everything
+
+
+def test_what_a_container_holds_is_not_available(machine: tuple[Path, Path]) -> None:
+    limit = machine[1]
+    limit.write_text("5000\n")
+    limit.with_name("memory.current").write_text("3000\n")
+    stat = limit.with_name("memory.stat")
+    # What it holds of files that it has read it can give away.
+    stat.write_text("anon 1200\nfile 1800\ninactive_file 700\nactive_file 1100\n")
+    assert available_memory() == 5000 - (3000 - 700)
+    limit.with_name("memory.current").write_text("9000\n")
+    assert available_memory() == 0
+    limit.write_text("9000000\n")
+    assert available_memory() == 3906 * 1024
+    limit.write_text("5000\n")
+    limit.with_name("memory.current").write_text("3000\n")
+    stat.write_text("anon 1200\n")
+    assert available_memory() == 2000
+    for unknown in ("inactive_file much\n", "nothing\n"):
+        stat.write_text(unknown)
+        assert available_memory() == 5000
 
 
 @pytest.mark.parametrize(

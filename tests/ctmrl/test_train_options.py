@@ -17,10 +17,12 @@ from ctmrl.methods import METHODS
 from ctmrl.methods.ctmrl import CTMRLConfig
 from ctmrl.methods.focal import FOCALConfig
 from ctmrl.presets import preset
+from ctmrl.runs import RunFolder, read_json
 from ctmrl.train import parse
 from datagen.dataset import task_file
 from meta_envs import ENVIRONMENTS
 from tests.ctmrl.commands import Commands
+from tests.ctmrl.conftest import FinishedRun
 from tests.datagen.examples import write_dataset
 
 
@@ -92,7 +94,9 @@ def mistake(
         ),
         (("--steps", "0"), "--steps must be at least 1, got 0"),
         (("--tau", "nan"), "--tau must be at least 1e-09, got nan"),
+        (("--divergence-target", "nan"), "--divergence-target must be a finite number, got nan"),
         (("--memory", "-1"), "--memory must be at least 0, got -1.0"),
+        (("--threads", "100000"), "--threads must be from 1 to 1024, got 100000"),
         (("--seed", "-1"), "--seed must be from 0 to 9.22337e+18, got -1"),
     ],
 )
@@ -155,6 +159,38 @@ def test_a_folder_of_something_else_is_left_alone(mistake: Any, tmp_path: Path) 
     (tmp_path / "out" / "thesis.tex").write_text("x")
     for words in ((), ("--restart",)):
         assert mistake(*words) == "out holds files that are not of a run: choose another --out"
+
+
+def test_a_folder_is_refused_before_the_data_are_read(
+    mistake: Any, finished_run: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ctmrl.data.OfflineData", None)
+    path = shutil.copytree(finished_run.path, tmp_path / "out")
+    said = "out holds a run with settings.training.steps = 40, this one has 60: "
+    assert mistake().startswith(said)
+    folder = RunFolder(path, read_json(path / "config.json"), restart=False)
+    assert mistake("--steps", "40") == "another process is at work in out: wait for it"
+    folder.close()
+    (path / "thesis.tex").write_text("x")
+    assert mistake("--restart").startswith("out also holds thesis.tex, which is not of a run: ")
+    # A finished run is shown without them too.
+    (path / "thesis.tex").unlink()
+    words = (*finished_run.words[1:], "--out", str(path))
+    monkeypatch.setattr(sys, "argv", ["train", *words])
+    assert run_command(command.main) == 0
+
+
+@pytest.mark.parametrize("content", ["{}", '{"groups": [1]}'])
+def test_a_damaged_evaluation_is_one_sentence(
+    content: str, finished_run: FinishedRun, commands: Commands, tmp_path: Path
+) -> None:
+    path = shutil.copytree(finished_run.path, tmp_path / "copy")
+    (path / "evaluation.json").write_text(content)
+    assert commands.run(*finished_run.words, "--out", str(path)) == 2
+    said = commands.output().splitlines()[-1]
+    assert said.startswith(f"error: {path / 'evaluation.json'} does not fit its run (")
+    assert said.endswith("): train again with --restart")
+    assert "Traceback" not in commands.output()
 
 
 @pytest.mark.parametrize(
