@@ -59,8 +59,8 @@ class ActorCriticConfig:
     behavior_cloning."""
     cloning_rank: float = 0.0
     """How much more actions count in cloning that are of better episodes: by e to this many times
-    the share of the task's data that are of episodes with lower returns. 0 clones all alike. Of no
-    use without behavior_cloning."""
+    the share of the task's data that are of episodes with lower returns, of the dense reward where
+    there are two. 0 clones all alike. Of no use without behavior_cloning."""
     value_expectile: float = 0.0
     """Above 0, the value network learns this expectile of Q at the data's own actions, as in IQL:
     above 0.5 what the better of them are worth; 0 lets it learn the value of the policy."""

@@ -28,7 +28,7 @@ class Transitions(NamedTuple):
         next_obs: [n, O].
         terminal: [n], 1.0 where the value of next_obs does not count.
         rank: [n], from 0 to below 1, the share of the task's rows that are of episodes with lower
-            returns than the row's own.
+            returns than the row's own, by this reward.
     """
 
     obs: Tensor
@@ -121,23 +121,29 @@ class OfflineData:
         # Twice, because the statistics are of the changes s' - s: so they need no second table.
         self._fill(dataset, lambda data: _with_changes(rows_of(data), self._layout))
         self._statistics = {seen: self._measure(seen) for seen in (False, True)}
-        self._fill(dataset, rows_of)
+        ranks = self._ranks(self.table[:, self._layout.context])
+        self._fill(dataset, rows_of, ranks.repeat_interleave(self._episode_rows))
         # Now, because after this to read all rows in their order is slow.
         learned = self.unpack(self.table)
         self.largest_reward = float(learned.reward.abs().max())
         self._mean_reward, self._end_rate = map(
             float, (learned.reward.mean(), learned.terminal.mean())
         )
-        self.table[:, -1] = self._ranks(learned.reward).repeat_interleave(self._episode_rows)
         self._table.filled()
 
-    def _fill(self, dataset: Dataset, rows_of: Callable[[TaskData], NDArray[np.float32]]) -> None:
+    def _fill(
+        self,
+        dataset: Dataset,
+        rows_of: Callable[[TaskData], NDArray[np.float32]],
+        rank: Tensor | None = None,
+    ) -> None:
         start = 0
         for task in self.tasks:
             for block in dataset.blocks(int(task)):
                 end = start + len(block)
-                # Without the rank, which is known when all is read.
                 self.table[start:end, :-1] = torch.from_numpy(rows_of(block))
+                if rank is not None:
+                    self.table[start:end, -1] = rank[start:end]
                 start = end
 
     def _measure(self, next_obs_in_context: bool) -> Statistics:

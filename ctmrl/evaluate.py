@@ -172,10 +172,12 @@ def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
 
 
 def _groups(stored: dict[str, Any], tasks: TaskSet) -> dict[str, NDArray[np.int64]]:
-    """The groups of a run's config.json; a KeyError, TypeError or ValueError if they cannot be."""
+    """The groups of a run's config.json; an error that `fitting` knows if they cannot be."""
     import numpy as np
 
     for name, rows in stored["groups"].items():
+        if name not in ("unseen", "seen"):
+            raise ValueError(f"groups.{name} is neither of unseen nor of seen tasks")
         if not rows or not all(isinstance(row, int) and 0 <= row < len(tasks) for row in rows):
             raise ValueError(f"groups.{name} is not of tasks from 0 to {len(tasks) - 1}")
     return {name: np.array(rows) for name, rows in stored["groups"].items()}

@@ -42,7 +42,7 @@ def offline_contexts(
     config: RunConfig,
     groups: Mapping[str, NDArray[np.int64]],
     seed: int,
-    learned_from: str | None = None,
+    learned_from: str,
 ) -> dict[str, Tensor]:
     """Contexts of the tasks' own data, drawn as in meta-training.
 
@@ -50,7 +50,7 @@ def offline_contexts(
         config: of the run; its dataset, slice and sizes of contexts are in it.
         groups: tasks by the groups' names.
         seed: of the draws, in each group anew.
-        learned_from: hash of the dataset that it must be, if any will not do.
+        learned_from: hash of the dataset that it must be.
 
     Returns:
         Transitions [R * n, T, O + A + 1 + O] by group, repetition by repetition.
@@ -60,7 +60,7 @@ def offline_contexts(
         DatasetError: it is missing or damaged.
     """
     dataset, found = open_data(config), {}
-    if learned_from not in (None, dataset.hash):
+    if learned_from != dataset.hash:
         raise UsageError(
             f"{dataset.path} does not hold the data that the run learned from: "
             "give --data with the folder that does"

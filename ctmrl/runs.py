@@ -115,7 +115,9 @@ def begun_with(path: Path, name: str) -> Any:
     """
     config = path / CONFIG
     settings = read_json(config).get("settings") if config.exists() else None
-    return with_later_settings(settings).get(name) if isinstance(settings, dict) else None
+    with fitting(config):
+        found = with_later_settings(settings).get(name) if isinstance(settings, dict) else None
+    return found
 
 
 def check_folder(path: Path, known: dict[str, Any], restart: bool) -> bool:
@@ -155,7 +157,9 @@ def _locked(path: Path) -> int:
     try:
         handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
-        raise RunError(f"{path} cannot be written to ({error.strerror}): try --out") from None
+        raise RunError(
+            f"{path} cannot be written to ({error.strerror}): choose another --out"
+        ) from None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -188,7 +192,8 @@ def _compare(path: Path, there: dict[str, Any], asked: dict[str, Any]) -> None:
     # Through JSON, because a tuple comes back as a list.
     unsaid = flatten({"settings": LATER_SETTINGS})
     flat, wanted = (unsaid | flatten(one) for one in (there, json.loads(to_json(asked))))
-    for key in sorted(flat.keys() | wanted.keys()):
+    # Settings first: the lists of tasks follow from them.
+    for key in sorted(flat.keys() | wanted.keys(), key=lambda k: (not k.startswith("settings"), k)):
         if flat.get(key) != wanted.get(key):
             raise RunError(
                 f"{path} holds a run with {key} = {flat.get(key)}, this one has "
@@ -219,7 +224,9 @@ class RunFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise RunError(f"{path} cannot be written to ({error.strerror}): try --out") from None
+            raise RunError(
+                f"{path} cannot be written to ({error.strerror}): choose another --out"
+            ) from None
         self._lock = _locked(path)
         try:
             self._begin(settings, restart)

@@ -29,7 +29,7 @@ from ctmrl.config import RunConfig
 from ctmrl.console import MISTAKES
 from ctmrl.errors import UsageError
 from ctmrl.report import print_report
-from ctmrl.runs import CONFIG
+from ctmrl.runs import CONFIG, begun_with
 from ctmrl.summary import find_records
 from ctmrl.table import SHARE, available_memory
 from datagen.accelerator import best_precision
@@ -78,7 +78,7 @@ def plan(config: RunConfig, folder: Path) -> tuple[list[RunConfig], int]:
     Each run's `workers` is that number, for the cores that it leaves to the others.
 
     Raises:
-        UsageError: the folder is a run's own.
+        UsageError: the folder is a run's own, or the seeds in it cannot go on together.
     """
     if (folder / CONFIG).exists():
         raise UsageError(
@@ -95,19 +95,29 @@ def plan(config: RunConfig, folder: Path) -> tuple[list[RunConfig], int]:
         )
         for seed in config.seeds
     ]
-    return [_with_precision(run) for run in runs], workers
+    return _in_one_precision(runs), workers
 
 
-def _with_precision(run: RunConfig) -> RunConfig:
-    """A run that begins with this machine's best precision in place of "auto".
+def _in_one_precision(runs: list[RunConfig]) -> list[RunConfig]:
+    """The runs with one precision in place of "auto": that of those that have begun, or the best.
 
-    The processor is timed for it here, once and before the seeds keep it busy, so that all of them
-    have the same. A run that has begun finds its own in its folder.
+    The processor is timed for it here, once and before the seeds keep it busy.
+
+    Raises:
+        UsageError: those that have begun have different ones.
     """
-    begun = run.out and (run.out / CONFIG).exists() and not run.restart
-    if run.precision != "auto" or begun:
-        return run
-    return dataclasses.replace(run, precision=best_precision(run.device))
+    first = runs[0]
+    if first.precision != "auto":
+        return runs
+    folders = [run.out for run in runs if run.out and not first.restart]
+    begun = sorted({found for folder in folders if (found := begun_with(folder, "precision"))})
+    if len(begun) > 1:
+        raise UsageError(
+            f"some seeds in {folders[0].parent} have begun in {begun[0]}, some in {begun[1]}, and "
+            "no report mixes them: choose another --out, or one --precision and --restart"
+        )
+    precision = begun[0] if begun else best_precision(first.device)
+    return [dataclasses.replace(run, precision=precision) for run in runs]
 
 
 def cores() -> int:

@@ -69,7 +69,7 @@ def best_behavior(dataset: Dataset) -> dict[int, float]:
 
 
 def known_settings(config: RunConfig, dataset: Dataset, split: Split) -> dict[str, Any]:
-    """What of config.json is known before the data are read."""
+    """All that decides the run's results and is known before the data are read."""
     from ctmrl.settings import without_later_settings
 
     # Of a device such as cuda:1, what decides the bytes.
@@ -81,14 +81,6 @@ def known_settings(config: RunConfig, dataset: Dataset, split: Split) -> dict[st
         "best_behavior": {str(task): value for task, value in best_behavior(dataset).items()},
         "versions": {name: metadata.version(name) for name in PACKAGES},
     }
-
-
-def settings_of(
-    config: RunConfig, dataset: Dataset, split: Split, learner: Learner
-) -> dict[str, Any]:
-    """What config.json holds: all that decides the run's results."""
-    known = known_settings(config, dataset, split)
-    return {**known, "dimensions": learner.method.dims._asdict()}
 
 
 def check(config: RunConfig) -> Dataset:
@@ -135,7 +127,8 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
     split = split_tasks(dataset, config.validate)
     path = config.out or default_folder(config)
     config = with_precision(config, path)
-    if runs.check_folder(path, known_settings(config, dataset, split), config.restart):
+    known = known_settings(config, dataset, split)
+    if runs.check_folder(path, known, config.restart):
         return _finished(path, console)
     data = OfflineData(
         dataset,
@@ -145,7 +138,7 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
         Room(config.memory, path),
     )
     learner = Learner(config, data)
-    settings = settings_of(config, dataset, split, learner)
+    settings = {**known, "dimensions": learner.method.dims._asdict()}
     folder = runs.RunFolder(path, settings, config.restart)
     try:
         if folder.finished:

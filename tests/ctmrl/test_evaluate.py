@@ -246,6 +246,7 @@ def test_a_config_of_another_version(
         ("groups", {"unseen": [2], "seen": [999]}, "groups.seen is not of tasks from 0 to 49"),
         ("groups", {"unseen": [-1]}, "groups.unseen is not of tasks from 0 to 49"),
         ("groups", {"unseen": [0.5]}, "groups.unseen is not of tasks from 0 to 49"),
+        ("groups", {"foo": [1]}, "groups.foo is neither of unseen nor of seen tasks"),
         ("groups", {"unseen": []}, "groups.unseen is not of tasks from 0 to 49"),
         ("dimensions", {"obs": 2, "act": 2, "tasks": 7, "steps": "x"}, "invalid literal for int()"),
     ],

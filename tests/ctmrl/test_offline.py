@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +15,15 @@ from ctmrl.config import RunConfig
 from ctmrl.errors import UsageError
 from ctmrl.meta_test import MetaTest
 from ctmrl.networks import Actor, ContextEncoder, mean_encoding
-from ctmrl.offline import offline_contexts
+from ctmrl.offline import offline_contexts, open_data
 from ctmrl.presets import preset
 from datagen.dataset import open_dataset
 from meta_envs import ENVIRONMENTS, MetaEnv, task_set
 from tests.ctmrl.commands import Commands, contents
 from tests.ctmrl.conftest import FinishedRun
 
-GROUPS = {"unseen": np.array([2, 7]), "seen": np.array([0, 4, 8])}
+Groups = dict[str, np.ndarray[Any, Any]]
+GROUPS: Groups = {"unseen": np.array([2, 7]), "seen": np.array([0, 4, 8])}
 
 
 @pytest.fixture
@@ -32,8 +34,13 @@ def config(wind_path: Path) -> RunConfig:
     )
 
 
+def given(config: RunConfig, groups: Groups = GROUPS, seed: int = 1) -> dict[str, torch.Tensor]:
+    """Contexts of the data that the config names."""
+    return offline_contexts(config, groups, seed, open_data(config).hash)
+
+
 def test_each_context_is_of_its_own_task(config: RunConfig, wind_path: Path) -> None:
-    found = offline_contexts(config, GROUPS, seed=1)
+    found = given(config)
     dataset = open_dataset(wind_path)
     for name, rows in GROUPS.items():
         contexts = found[name].numpy()
@@ -49,8 +56,8 @@ def test_each_context_is_of_its_own_task(config: RunConfig, wind_path: Path) -> 
 
 
 def test_draws_depend_on_the_seed_and_not_on_other_groups(config: RunConfig) -> None:
-    found, other = (offline_contexts(config, GROUPS, seed) for seed in (1, 2))
-    alone = offline_contexts(config, {"seen": GROUPS["seen"]}, seed=1)
+    found, other = (given(config, seed=seed) for seed in (1, 2))
+    alone = given(config, {"seen": GROUPS["seen"]})
     assert torch.equal(found["seen"], alone["seen"])
     assert not torch.equal(found["seen"], other["seen"])
 
@@ -59,11 +66,11 @@ def test_the_policy_is_scored_on_the_given_context(config: RunConfig) -> None:
     ones = torch.ones(7)
     encoder = ContextEncoder((0.1 * ones, 0.5 * ones), 2, (11,), 5)
     actor = Actor((torch.zeros(2), torch.ones(2)), 5, (13,), 2)
-    tasks, given = task_set("point_robot_wind"), offline_contexts(config, GROUPS, seed=1)
-    results = MetaTest(encoder, actor, tasks, config.meta_test, 0).run(GROUPS, given=given)
+    tasks, contexts = task_set("point_robot_wind"), given(config)
+    results = MetaTest(encoder, actor, tasks, config.meta_test, 0).run(GROUPS, given=contexts)
     for name, rows in GROUPS.items():
         with torch.no_grad():
-            z = mean_encoding(encoder(given[name]))
+            z = mean_encoding(encoder(contexts[name]))
         result = results[name]
         assert result.curve.shape == (1, len(rows))
         np.testing.assert_allclose(result.contexts.reshape(z.shape), z, rtol=1e-5, atol=1e-6)
@@ -96,7 +103,7 @@ def test_the_command(wind_path: Path, commands: Commands, tmp_path: Path) -> Non
 def test_tasks_without_data_are_named(config: RunConfig, good_path: Path) -> None:
     config = dataclasses.replace(config, data=good_path)
     with pytest.raises(UsageError, match=r"data of the unseen tasks, and .* has none of 2, 7: py"):
-        offline_contexts(config, GROUPS, seed=0)
+        given(config)
 
 
 def test_other_data_than_the_run_learned_from_are_refused(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,7 +21,7 @@ from ctmrl.numbers import Kind, Numbers, NumbersAhead
 from ctmrl.recording import Given
 from ctmrl.synthetic import synthetic_dataset
 from ctmrl.table import Room
-from ctmrl.train import check, settings_of, split_tasks
+from ctmrl.train import check, known_settings, split_tasks
 from datagen.accelerator import WARM_UP
 from datagen.dataset import open_dataset
 from tests.ctmrl.examples import generator
@@ -314,16 +313,13 @@ def test_the_agent_of_a_gpu_is_a_copy_on_the_host(wind_data: OfflineData) -> Non
         assert one.data_ptr() != other.data_ptr()
 
 
-def test_the_kind_of_device_is_a_setting(wind_path: Path, wind_data: OfflineData) -> None:
+def test_the_kind_of_device_is_a_setting(wind_path: Path) -> None:
     dataset = open_dataset(wind_path)
     split = split_tasks(dataset, False)
-    learner: Any = SimpleNamespace(method=Learner(config("focal"), wind_data).method)
     for name, kind in (("cuda:1", "cuda"), ("cuda", "cuda")):
-        learner.device = torch.device(name)
         made = dataclasses.replace(config("focal"), device=name)
-        assert settings_of(made, dataset, split, learner)["settings"]["device"] == kind
-    learner.device = torch.device("cpu")
-    assert "device" not in settings_of(config("focal"), dataset, split, learner)["settings"]
+        assert known_settings(made, dataset, split)["settings"]["device"] == kind
+    assert "device" not in known_settings(config("focal"), dataset, split)["settings"]
 
 
 @pytest.mark.parametrize("device", ["nonsense", "cuda:99", "meta", ""])

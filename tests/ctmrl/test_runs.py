@@ -17,7 +17,7 @@ import torch
 
 from ctmrl import runs
 from ctmrl.errors import UsageError
-from ctmrl.runs import RunError, RunFolder, check_folder
+from ctmrl.runs import RunError, RunFolder, begun_with, check_folder
 from tests.ctmrl.commands import Commands, contents
 
 SETTINGS: dict[str, Any] = {
@@ -192,7 +192,7 @@ def test_what_is_refused_is_refused_before_the_settings_are_complete(
     (path / "config.json").unlink()
     with pytest.raises(RunError, match="holds files that are not of a run"):
         check_folder(path, known, restart=False)
-    with pytest.raises(RunError, match=r"tex cannot be written to \(.*\): try --out$"):
+    with pytest.raises(RunError, match=r"tex cannot be written to \(.*\): choose another --out$"):
         check_folder(path / "thesis.tex", known, restart=False)
     # Nothing is kept locked.
     (path / "thesis.tex").unlink()
@@ -212,7 +212,7 @@ def test_what_a_kill_left_before_the_first_file_is_no_obstacle(path: Path) -> No
 def test_a_file_in_the_way_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "x").write_text("")
     for path in (tmp_path / "x", tmp_path / "x" / "y"):
-        with pytest.raises(RunError, match=r"x(/y)? cannot be written to \(.*\): try --out$"):
+        with pytest.raises(RunError, match=r"x(/y)? cannot be written to \(.*\): choose another --out$"):
             RunFolder(path, SETTINGS, restart=False)
 
 
@@ -382,3 +382,18 @@ def test_rows_of_a_later_version_keep_the_columns(tmp_path: Path) -> None:
     folder.append_metrics({"step": 2, "new": 9.0, "b": 3.0})
     folder.close()
     assert (tmp_path / "run" / "metrics.csv").read_text() == "step,a,b\n1,0.5,2.0\n2,,3.0\n"
+
+
+def test_the_setting_of_a_damaged_run_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"settings": {"actor_critic": 3}}')
+    with pytest.raises(RunError, match=r"config\.json does not fit its run \('int' object"):
+        begun_with(tmp_path, "precision")
+    assert begun_with(tmp_path / "none", "precision") is None
+
+
+def test_settings_that_differ_are_told_before_what_follows_from_them(tmp_path: Path) -> None:
+    there = {"groups": {"seen": [1, 2]}, "settings": {"validate": False}}
+    (tmp_path / "config.json").write_text(json.dumps(there))
+    asked = {"groups": {"seen": [1]}, "settings": {"validate": True}}
+    with pytest.raises(RunError, match=r"holds a run with settings\.validate = False, this one"):
+        check_folder(tmp_path, asked, restart=False)

@@ -220,21 +220,28 @@ def test_the_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert plan(dataclasses.replace(config, workers=3), tmp_path)[1] == 3
 
 
-def test_seeds_that_begin_have_one_best_precision(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def begin_in(folder: Path, precision: str) -> None:
+    """Leave what a run that has begun in a precision leaves."""
+    folder.mkdir(exist_ok=True)
+    settings = {} if precision == "float32" else {"precision": precision}
+    (folder / "config.json").write_text(json.dumps({"settings": settings}))
+
+
+def test_seeds_have_one_precision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(seeds, "best_precision", lambda device: "bfloat16")
-    (tmp_path / "seed-5").mkdir()
-    (tmp_path / "seed-5" / "config.json").write_text("{}")
     config = dataclasses.replace(smoke(), seeds=(7, 5, 3), precision="auto")
 
     def precisions(config: RunConfig) -> list[str]:
         return [run.precision for run in plan(config, tmp_path)[0]]
 
-    # What the other has begun with is in its folder.
-    assert precisions(config) == ["bfloat16", "auto", "bfloat16"]
+    assert precisions(config) == ["bfloat16"] * 3
+    begin_in(tmp_path / "seed-5", "float32")
+    assert precisions(config) == ["float32"] * 3
     assert precisions(dataclasses.replace(config, restart=True)) == ["bfloat16"] * 3
-    assert precisions(dataclasses.replace(config, precision="float32")) == ["float32"] * 3
+    assert precisions(dataclasses.replace(config, precision="bfloat16")) == ["bfloat16"] * 3
+    begin_in(tmp_path / "seed-3", "bfloat16")
+    with pytest.raises(UsageError, match="have begun in bfloat16, some in float32, and no report"):
+        precisions(config)
 
 
 def test_cores() -> None:
