@@ -34,7 +34,7 @@ RESULTS = Path(__file__).parent / "results"
 SETTINGS = (
     *("--batch-size", "64", "--context-size", "128", "--target-rate", "0.02"),
     *("--gamma", "0.98", "--learning-rate", "5e-4", "--value-from-data"),
-    *("--cloning-advantage", "0"),
+    *("--cloning-advantage", "0", "--cloning-rank", "0"),
 )
 """Of all runs, whatever the preset."""
 CLONING = ("--no-behavior-regularization", "--reward-scale", "50", "--behavior-cloning")

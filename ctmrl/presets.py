@@ -126,8 +126,14 @@ ROBOT: Settings = {
     "random_episodes": 2,
     "policy_episodes": 2,
 }
-# Of their `standard` data, mostly good, weights by advantage learn less than cloning all alike.
-LEGS = ROBOT | {"random_episodes": 10, "behavior_cloning": 2.0, "cloning_advantage": 0.0}
+# Weights by an episode's return tell good actions from bad, those by advantage do not: what they
+# learn is as good as the policies that the data end with (docs/methods/actor_critic.md).
+LEGS = ROBOT | {
+    "random_episodes": 10,
+    "behavior_cloning": 2.0,
+    "cloning_advantage": 0.0,
+    "cloning_rank": 10.0,
+}
 # With the value of the policy's own actions returns are those of standing still
 # (docs/methods/actor_critic.md).
 ANT = ROBOT | {
