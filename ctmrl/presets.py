@@ -126,8 +126,8 @@ ROBOT: Settings = {
     "random_episodes": 2,
     "policy_episodes": 2,
 }
-# Weights by an episode's return tell good actions from bad, those by advantage do not: what they
-# learn is as good as the policies that the data end with (docs/methods/actor_critic.md).
+# Weights by an episode's return tell good actions from bad, those by advantage do not
+# (docs/methods/actor_critic.md).
 LEGS = ROBOT | {
     "random_episodes": 10,
     "behavior_cloning": 2.0,
