@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+
+from ctmrl.protocols import Protocol
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
 
     from ctmrl.agent import Agent
     from ctmrl.config import RunConfig
+    from ctmrl.meta_test import MetaTestResult
     from meta_envs import TaskSet
 
 
@@ -27,17 +31,20 @@ class EvaluateConfig:
     """Run folder, such as runs/point_robot_wind/ctmrl/seed-0."""
     fresh: int = 0
     """Instead of the dataset's tasks, this many fresh ones from the same distribution."""
-    offline: bool = False
-    """Contexts of the tasks' own offline data in place of exploration: what the field calls the
-    offline protocol. The dataset must have the test tasks."""
+    protocols: tuple[Protocol, ...] = ("np_online",)
+    """How contexts come about, one or more, all in one pass: np_online explores at random and then
+    with the policy, as training's own meta-test does; online with the deterministic policy alone;
+    offline not at all, its contexts are of the tasks' own data, so that the dataset must have the
+    test tasks."""
     data: Path | None = None
-    """Dataset folder for --offline, of the data that the run learned from; default
+    """Dataset folder for offline contexts, of the data that the run learned from; default
     datasets/<environment>."""
     seed: int | None = None
-    """Of exploration or of the offline contexts, and of the fresh tasks; the run's own seed by
+    """Of exploration and of the offline contexts, and of the fresh tasks; the run's own seed by
     default."""
     out: Path | None = None
-    """Also write the result as JSON and its pictures into this folder."""
+    """Also write the result as JSON and its pictures into this folder; of several protocols into a
+    folder of its name in there each."""
     repetitions: int | None = field(default=None)
     """Independent adaptations of each task; the run's own number by default."""
     unfinished: bool = False
@@ -45,78 +52,118 @@ class EvaluateConfig:
     diverged."""
 
 
-def evaluate_agent(  # noqa: PLR0913 - each decides what is measured
+def evaluate_agent(
     agent: Agent,
     config: RunConfig,
     tasks: TaskSet,
     groups: dict[str, NDArray[np.int64]],
     best_behavior: dict[int, float],
     seed: int,
-    given: dict[str, Tensor] | None = None,
 ) -> dict[str, Any]:
-    """Meta-test an agent.
+    """Meta-test an agent by np_online; see `evaluate_protocols`."""
+    found = evaluate_protocols(
+        agent, config, tasks, groups, best_behavior, seed, {"np_online": None}
+    )
+    return found["np_online"]
+
+
+def evaluate_protocols(  # noqa: PLR0913 - each decides what is measured
+    agent: Agent,
+    config: RunConfig,
+    tasks: TaskSet,
+    groups: dict[str, NDArray[np.int64]],
+    best_behavior: dict[int, float],
+    seed: int,
+    protocols: Mapping[Protocol, dict[str, Tensor] | None],
+) -> dict[Protocol, dict[str, Any]]:
+    """Meta-test an agent by one or more protocols, all in one vector environment.
 
     Args:
         agent: encoder and actor.
-        config: of its run; the protocol is in it.
+        config: of its run; how much it explores is in it.
         tasks: the task set.
         groups: rows of it by name, such as `unseen` and `seen`.
         best_behavior: return of each task's best behaviour policy, where known.
-        seed: of the exploration.
-        given: contexts of each group in place of exploration, as `offline_contexts` gives them.
+        seed: of the exploration, in each protocol anew.
+        protocols: by which; for `offline` with contexts of each group, as `offline_contexts` gives
+            them.
 
     Returns:
-        What evaluation.json holds; returns are undiscounted sums, means where not said otherwise.
+        What evaluation.json holds, by protocol; returns are undiscounted sums, means where not said
+        otherwise.
     """
-    import torch
-
-    from ctmrl.meta_test import MetaTest
-    from ctmrl.report import score
+    from ctmrl.meta_test import Group, MetaTest
     from ctmrl.seeds import own_cores
     from meta_envs import reference_returns
 
     threads = own_cores(config)
     references = reference_returns(tasks, threads=threads)
-    record: dict[str, Any] = {
-        "env": config.env,
-        "method": config.label if given is None else f"{config.label}, offline contexts",
-        "seed": config.seed,
-        "evaluation_seed": seed,
-        "protocol": {
-            "random_episodes": 0 if given is not None else config.meta_test.random_episodes,
-            "policy_episodes": 0 if given is not None else config.meta_test.policy_episodes,
-            "scored_episodes": config.meta_test.scored_episodes,
-            "repetitions": config.meta_test.repetitions,
-        },
-        "param_names": list(tasks.param_names),
-        "groups": {},
-    }
-    if agent.method.note:
-        record["note"] = agent.method.note
     test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed, threads)
-    results = test.run(groups, given=given)
-    for name, rows in groups.items():
-        result = results[name]
-        anchors = {key: float(values[rows].mean()) for key, values in references.items()}
-        if best_behavior and all(int(row) in best_behavior for row in rows):
-            best = [best_behavior[int(row)] for row in rows]
-            anchors["best_behavior"] = sum(best) / len(best)
-        value = float(result.returns.mean())
-        contexts = torch.from_numpy(result.contexts.mean(axis=0))
-        codes = agent.method.code_of(contexts)
-        record["groups"][name] = {
-            "tasks": rows.tolist(),
-            "params": tasks.params[rows].tolist(),
-            "return": value,
-            "score": score(value, anchors),
-            "task_returns": result.returns.mean(axis=0).tolist(),
-            "repetition_returns": result.returns.mean(axis=1).tolist(),
-            "curve": result.curve.tolist(),
-            "references": anchors,
-            "contexts": contexts.tolist(),
-            "codes": None if codes is None else codes.tolist(),
+    asked = {
+        f"{protocol}/{name}": Group(rows, protocol, None if data is None else data[name])
+        for protocol, data in protocols.items()
+        for name, rows in groups.items()
+    }
+    results = test.run(asked)
+    records: dict[Protocol, dict[str, Any]] = {}
+    for protocol in protocols:
+        record: dict[str, Any] = {
+            "env": config.env,
+            "method": config.label if protocol == "np_online" else f"{config.label}, {protocol}",
+            "seed": config.seed,
+            "evaluation_seed": seed,
+            "protocol": _protocol(protocol, config),
+            "param_names": list(tasks.param_names),
+            "groups": {},
         }
-    return record
+        if agent.method.note:
+            record["note"] = agent.method.note
+        for name, rows in groups.items():
+            anchors = {key: float(values[rows].mean()) for key, values in references.items()}
+            if best_behavior and all(int(row) in best_behavior for row in rows):
+                best = [best_behavior[int(row)] for row in rows]
+                anchors["best_behavior"] = sum(best) / len(best)
+            result = results[f"{protocol}/{name}"]
+            record["groups"][name] = {
+                "tasks": rows.tolist(),
+                "params": tasks.params[rows].tolist(),
+                **_scored(agent, result, anchors),
+            }
+        records[protocol] = record
+    return records
+
+
+def _protocol(protocol: Protocol, config: RunConfig) -> dict[str, Any]:
+    """A protocol's name, and how much of everything it has."""
+    import dataclasses
+
+    found = dataclasses.asdict(config.meta_test)
+    if protocol != "np_online":
+        explored = config.meta_test.random_episodes + config.meta_test.policy_episodes
+        policy = explored if protocol == "online" else 0
+        found |= {"random_episodes": 0, "policy_episodes": policy}
+    return {"name": protocol} | found
+
+
+def _scored(agent: Agent, result: MetaTestResult, anchors: dict[str, float]) -> dict[str, Any]:
+    """A group's result, as it is in a record."""
+    import torch
+
+    from ctmrl.report import score
+
+    value = float(result.returns.mean())
+    contexts = torch.from_numpy(result.contexts.mean(axis=0))
+    codes = agent.method.code_of(contexts)
+    return {
+        "return": value,
+        "score": score(value, anchors),
+        "task_returns": result.returns.mean(axis=0).tolist(),
+        "repetition_returns": result.returns.mean(axis=1).tolist(),
+        "curve": result.curve.tolist(),
+        "references": anchors,
+        "contexts": contexts.tolist(),
+        "codes": None if codes is None else codes.tolist(),
+    }
 
 
 def _check_out(config: EvaluateConfig) -> None:
@@ -129,8 +176,8 @@ def _check_out(config: EvaluateConfig) -> None:
         raise UsageError(f"--out {config.out} is {whose}: choose another folder")
 
 
-def _make_out(out: Path) -> None:
-    """Make the output folder, and be sure that files can be written there.
+def _folders(config: EvaluateConfig) -> dict[Protocol, Path]:
+    """Make each protocol's folder, if any, and be sure that files can be written there.
 
     Raises:
         UsageError: they cannot.
@@ -139,13 +186,19 @@ def _make_out(out: Path) -> None:
 
     from ctmrl.errors import UsageError
 
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out).close()
-    except OSError as error:
-        raise UsageError(
-            f"--out {out} cannot be written to ({error.strerror}): choose another folder"
-        ) from None
+    if config.out is None:
+        return {}
+    several = len(config.protocols) > 1
+    folders = {one: config.out / one if several else config.out for one in config.protocols}
+    for folder in folders.values():
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise UsageError(
+                f"--out {config.out} cannot be written to ({error.strerror}): choose another folder"
+            ) from None
+    return folders
 
 
 def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
@@ -161,10 +214,13 @@ def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
     _check_out(config)
     if config.fresh < 0:
         raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
-    if config.fresh and config.offline:
-        raise UsageError("--offline is for tasks with data, and --fresh tasks have none")
-    if config.data is not None and not config.offline:
-        raise UsageError("--data is for --offline: no other evaluation reads a dataset")
+    if len({*config.protocols}) != len(config.protocols):
+        raise UsageError(f"--protocols names one twice: {' '.join(config.protocols)}")
+    offline = "offline" in config.protocols
+    if config.fresh and offline:
+        raise UsageError("--protocols offline is for tasks with data, and --fresh tasks have none")
+    if config.data is not None and not offline:
+        raise UsageError("--data is for --protocols offline: no other reads a dataset")
     if config.repetitions is not None:
         protocol = dataclasses.replace(run.meta_test, repetitions=config.repetitions)
         run = dataclasses.replace(run, meta_test=protocol)
@@ -224,18 +280,22 @@ def main(config: EvaluateConfig) -> None:
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)
         groups, best = {"fresh": np.arange(config.fresh)}, {}
-    given = offline_contexts(run_config, groups, seed, learned_from) if config.offline else None
-    if config.out is not None:
-        _make_out(config.out)
-    record = evaluate_agent(agent, run_config, tasks, groups, best, seed, given)
+    protocols = {
+        one: offline_contexts(run_config, groups, seed, learned_from) if one == "offline" else None
+        for one in config.protocols
+    }
+    folders = _folders(config)
+    records = evaluate_protocols(agent, run_config, tasks, groups, best, seed, protocols)
     console = Console()
     if step < dims.steps:
-        record["step"] = step
         console.print(f"The checkpoint of step {step} of {dims.steps}.")
-    console.print(result_table(record))
-    if config.out is not None:
-        write_whole(config.out / runs.EVALUATION, runs.to_json(record))
-        write_pictures(record, config.out)
+    for protocol, record in records.items():
+        if step < dims.steps:
+            record["step"] = step
+        console.print(result_table(record))
+        if folder := folders.get(protocol):
+            write_whole(folder / runs.EVALUATION, runs.to_json(record))
+            write_pictures(record, folder)
 
 
 if __name__ == "__main__":

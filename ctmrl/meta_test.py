@@ -1,12 +1,9 @@
-"""The two-phase meta-test: explore at random, then with the policy, then score fresh episodes.
-
-Or without exploration, on contexts that are given.
-"""
+"""The meta-test: adapt to a task by one of the field's protocols, then score fresh episodes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ctmrl.networks import Actor, Encoder
+from ctmrl.protocols import Protocol
 from meta_envs import MetaVectorEnv, TaskSet
 
 Floats = NDArray[np.float64]
@@ -22,7 +20,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MetaTestConfig:
-    """How much an agent may explore a task before it is scored."""
+    """How much an agent may explore a task before it is scored; `online` has as many episodes."""
 
     random_episodes: int = 10
     """Phase one: episodes of uniformly random actions."""
@@ -34,13 +32,28 @@ class MetaTestConfig:
     """Independent repetitions of the whole adaptation of each task."""
 
 
+class Group(NamedTuple):
+    """Tasks to adapt to side by side, and how.
+
+    Attributes:
+        rows: n tasks of the task set.
+        protocol: how contexts come about.
+        data: for `offline`, the tasks' transitions [R * n, T, O + A + 1 + O], repetition by
+            repetition.
+    """
+
+    rows: NDArray[np.int64]
+    protocol: Protocol = "np_online"
+    data: Tensor | None = None
+
+
 class MetaTestResult(NamedTuple):
     """What a meta-test of n tasks gave; E exploration episodes, R repetitions.
 
     Attributes:
         returns: final return of each repetition and task, [R, n].
         curve: return of one deterministic episode after 0..E exploration episodes, mean over
-            repetitions, [E + 1, n].
+            repetitions, [E + 1, n]; of `online` the exploration episodes are those.
         contexts: final context of each repetition and task, [R, n, Z].
     """
 
@@ -71,7 +84,9 @@ class _Seen(NamedTuple):
 
 Episode = Generator[NDArray[np.float32], _Seen, Floats]
 """Gives actions [n, A], is sent what they led to, and ends in returns [n]."""
-Protocol = Generator[NDArray[np.float32], _Seen, MetaTestResult]
+Exploration = Generator[NDArray[np.float32], _Seen, list[Floats]]
+"""The same for a group's exploration; ends in the returns on the way."""
+Episodes = Generator[NDArray[np.float32], _Seen, MetaTestResult]
 """The same for all episodes of a group; ends in its result."""
 
 
@@ -140,15 +155,26 @@ class _Adaptation:
         """Returns [n] of one deterministic episode on the contexts so far."""
         return self.episode(self.deterministic(self.z), explore=False)
 
-    def protocol(self, config: MetaTestConfig) -> Protocol:
-        """The whole adaptation."""
-        curve = []
+    def explored(self, protocol: Protocol, config: MetaTestConfig) -> Exploration:
+        """Fill the contexts; the returns [n] of a deterministic episode before each episode."""
+        curve: list[Floats] = []
+        if protocol == "offline":
+            return curve
         for episode in range(config.random_episodes + config.policy_episodes):
+            if protocol == "online":
+                act = self.deterministic(self.z)
+                curve.append((yield from self.episode(act, explore=True)))
+                continue
             curve.append((yield from self.score()))
             if episode < config.random_episodes:
                 yield from self.episode(self.random, explore=True)
             else:
                 yield from self.episode(self.stochastic(self.z), explore=True)
+        return curve
+
+    def episodes(self, protocol: Protocol, config: MetaTestConfig) -> Episodes:
+        """The whole adaptation."""
+        curve = yield from self.explored(protocol, config)
         last = []
         for _ in range(config.scored_episodes):
             last.append((yield from self.score()))
@@ -170,7 +196,7 @@ class MetaTest:
         encoder: makes contexts from transitions.
         actor: acts on contexts.
         tasks: the task set.
-        config: the protocol.
+        config: how much of everything.
         seed: of random actions, policy noise and the environments, in each group anew.
         threads: that step the environments; as many as there are by default. No number depends on
             them.
@@ -186,9 +212,8 @@ class MetaTest:
     @torch.no_grad()
     def run(
         self,
-        groups: Mapping[str, NDArray[np.int64]],
+        groups: Mapping[str, Group],
         each_step: Callable[[], None] | None = None,
-        given: Mapping[str, Tensor] | None = None,
     ) -> dict[str, MetaTestResult]:
         """Adapt to each task of some groups and score it; the results by the groups' names.
 
@@ -196,42 +221,38 @@ class MetaTest:
         the others, bit for bit.
 
         Args:
-            groups: rows of the task set by name.
+            groups: tasks and protocols by name.
             each_step: called before each step; what it raises ends the meta-test.
-            given: contexts to score each group's tasks on in place of exploration, transitions
-                [R * n, T, O + A + 1 + O], repetition by repetition.
         """
-        config = self.config
-        if given is not None:
-            config = replace(config, random_episodes=0, policy_episodes=0)
-        rows = {name: np.tile(own, self.config.repetitions) for name, own in groups.items()}
+        repetitions = self.config.repetitions
+        rows = {name: np.tile(group.rows, repetitions) for name, group in groups.items()}
         every = np.concatenate([*rows.values()])
         env = MetaVectorEnv(self.tasks.env, tasks=every, task_set=self.tasks, threads=self.threads)
         env.reset(seed=[self.seed + place for own in rows.values() for place in range(len(own))])
         dense = self.encoder.sees_dense_reward and env.definition.sparse
         actions = np.zeros(env.action_space.shape or (), dtype=np.float32)
-        at_work: list[tuple[str, slice, Protocol]] = []
-        for name, own in rows.items():
+        at_work: list[tuple[str, slice, Episodes]] = []
+        for name, group in groups.items():
             begin = at_work[-1][1].stop if at_work else 0
-            place = slice(begin, begin + len(own))
+            place = slice(begin, begin + len(rows[name]))
             adaptation = _Adaptation(env, place, self)
-            if given is not None:
-                adaptation.read(given[name])
-            protocol = adaptation.protocol(config)
-            actions[place] = next(protocol)
-            at_work.append((name, place, protocol))
+            if group.data is not None:
+                adaptation.read(group.data)
+            episodes = adaptation.episodes(group.protocol, self.config)
+            actions[place] = next(episodes)
+            at_work.append((name, place, episodes))
         results: dict[str, MetaTestResult] = {}
         while len(results) < len(groups):
             if each_step is not None:
                 each_step()
             obs, reward, terminated, truncated, info = env.step(actions)
             read, over = info["dense_reward"] if dense else reward, terminated | truncated
-            for name, place, protocol in at_work:
+            for name, place, episodes in at_work:
                 if name in results:
                     continue
                 seen = _Seen(obs[place], reward[place], read[place], over[place])
                 try:
-                    actions[place] = protocol.send(seen)
+                    actions[place] = episodes.send(seen)
                 except StopIteration as stop:
                     results[name] = stop.value
         return {name: results[name] for name in groups}
@@ -246,4 +267,4 @@ def meta_test(
     seed: int,
 ) -> MetaTestResult:
     """The meta-test of one group of tasks; see `MetaTest` for the arguments."""
-    return MetaTest(encoder, actor, tasks, config, seed).run({"": rows})[""]
+    return MetaTest(encoder, actor, tasks, config, seed).run({"": Group(rows)})[""]

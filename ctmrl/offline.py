@@ -69,10 +69,10 @@ def offline_contexts(
     for name, rows in groups.items():
         if missing := sorted({*rows.tolist()} - {*dataset.tasks.tolist()}):
             raise UsageError(
-                f"--offline needs data of the {name} tasks, and {dataset.path} has none of "
-                f"{', '.join(map(str, missing))}: python -m datagen.collect --env {config.env} "
-                f"--out {dataset.path}, with its --budget and --seed, collects all tasks, "
-                "for a new run to learn from"
+                f"--protocols offline needs data of the {name} tasks, and {dataset.path} has "
+                f"none of {', '.join(map(str, missing))}: python -m datagen.collect "
+                f"--env {config.env} --out {dataset.path}, with its --budget and --seed, collects "
+                "all tasks, for a new run to learn from"
             )
         data = OfflineData(dataset, rows, dense_context=config.context.dense_reward_in_context)
         draws = torch.Generator().manual_seed(seed)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ctmrl.config import RunConfig
 from ctmrl.errors import Diverged
-from ctmrl.meta_test import MetaTest
+from ctmrl.meta_test import Group, MetaTest
 from ctmrl.meta_train import Learner
 from ctmrl.seeds import own_cores
 from ctmrl.threads import settle_threads
@@ -60,7 +60,7 @@ def measure_of(config: RunConfig, learner: Learner) -> Measure:
     tasks = learner.data.tasks
 
     def measure(each_step: Callable[[], None] | None) -> float:
-        return float(test.run({"": tasks}, each_step)[""].returns.mean())
+        return float(test.run({"": Group(tasks)}, each_step)[""].returns.mean())
 
     return measure
 

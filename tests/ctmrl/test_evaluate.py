@@ -63,7 +63,7 @@ def test_what_a_record_holds(finished_run: FinishedRun, agent: Agent) -> None:
     config = config_from_settings(read_json(finished_run.path / "config.json"), Path())
     tasks = task_set("point_robot_wind")
     references = reference_returns(tasks)
-    assert record["protocol"] == dataclasses.asdict(config.meta_test)
+    assert record["protocol"] == {"name": "np_online"} | dataclasses.asdict(config.meta_test)
     assert (record["env"], record["method"], record["seed"]) == ("point_robot_wind", "ctmrl", 0)
     assert record["evaluation_seed"] == 0
     assert record["param_names"] == ["wind_x", "wind_y"]

@@ -1,8 +1,9 @@
-"""The two-phase meta-test against one written from its description, environment by environment."""
+"""The meta-test against one written from its description, environment by environment."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ctmrl.data import OfflineData
-from ctmrl.meta_test import MetaTest, MetaTestConfig, MetaTestResult, meta_test
+from ctmrl.meta_test import Group, MetaTest, MetaTestConfig, MetaTestResult, meta_test
 from ctmrl.networks import Actor, ContextEncoder
 from meta_envs import ENVIRONMENTS, MetaEnv, TaskSet, task_set
 
@@ -109,7 +110,11 @@ class Adaptation:
 
 @torch.no_grad()
 def by_single_environments(
-    encoder: ContextEncoder, actor: Actor, tasks: TaskSet, protocol: MetaTestConfig
+    encoder: ContextEncoder,
+    actor: Actor,
+    tasks: TaskSet,
+    protocol: MetaTestConfig,
+    online: bool = False,
 ) -> tuple[MetaTestResult, list[int], list[int]]:
     """The result, and how many steps each environment explored and was scored."""
     rows = [int(task) for _ in range(protocol.repetitions) for task in ROWS]
@@ -117,6 +122,9 @@ def by_single_environments(
     kinds = ["random"] * protocol.random_episodes + ["policy"] * protocol.policy_episodes
     curve = []
     for kind in kinds:
+        if online:
+            curve.append(run.episode("read and scored"))
+            continue
         curve.append(run.episode("score"))
         run.episode(kind)
     scored = [run.episode("score") for _ in range(protocol.scored_episodes)]
@@ -164,6 +172,24 @@ def test_the_protocol(
         assert len(set(scored)) > 1
     else:
         assert set(counts) == {episodes * ENVIRONMENTS[tasks.env].horizon}
+
+
+@pytest.mark.parametrize("change", [{}, {"repetitions": 1, "scored_episodes": 3}], ids=str)
+def test_online_explores_with_the_deterministic_policy_from_the_start(
+    tasks: TaskSet, change: dict[str, int], encoder: CountingEncoder, actor: Actor
+) -> None:
+    protocol = dataclasses.replace(PROTOCOL, **change)
+    test = MetaTest(encoder, actor, tasks, protocol, SEED)
+    found = test.run({"some": Group(ROWS, "online")})["some"]
+    wanted, _, _ = by_single_environments(encoder, actor, tasks, protocol, online=True)
+    assert found.curve.shape == (6, 3)
+    np.testing.assert_allclose(found.returns, wanted.returns, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.curve, wanted.curve, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.contexts, wanted.contexts, rtol=1e-4, atol=1e-5)
+    # Its first episode has no context, its others have one that grows; none is random.
+    assert len({round(value, 4) for value in found.curve[:, 0]}) > 1 or tasks.env.startswith("spa")
+    other = meta_test(encoder, actor, tasks, ROWS, protocol, SEED)
+    assert (found.contexts != other.contexts).any(axis=-1).all()
 
 
 def test_contexts_are_of_all_explored_transitions_random_ones_first(
@@ -279,9 +305,7 @@ def same(one: MetaTestResult, other: MetaTestResult) -> bool:
     )
 
 
-def counted(
-    test: MetaTest, groups: dict[str, NDArray[np.int64]]
-) -> tuple[dict[str, MetaTestResult], int]:
+def counted(test: MetaTest, groups: dict[str, Group]) -> tuple[dict[str, MetaTestResult], int]:
     """The results, and how many steps they took."""
     steps: list[None] = []
     return test.run(groups, lambda: steps.append(None)), len(steps)
@@ -294,11 +318,20 @@ def test_a_group_beside_others_is_what_it_is_alone(
     if env == "noisy_robot":
         request.getfixturevalue("noisy_robot")
     test = MetaTest(*networks(env), task_set(env), PROTOCOL, SEED)
-    groups = {"few": ROWS, "one": np.array([3]), "many": np.array([9, 4, 1, 2, 8, 0, 7])}
+    sizes = MetaEnv(env)
+    (obs,), (act,) = sizes.observation_space.shape or (), sizes.action_space.shape or ()
+    data = torch.rand(6, 5, 2 * obs + act + 1, generator=torch.Generator().manual_seed(1))
+    groups = {
+        "few": Group(ROWS),
+        "one": Group(np.array([3])),
+        "many": Group(np.array([9, 4, 1, 2, 8, 0, 7])),
+        "online": Group(ROWS, "online"),
+        "offline": Group(ROWS, "offline", data),
+    }
     alone: dict[str, MetaTestResult] = {}
     lengths: dict[str, int] = {}
-    for name, rows in groups.items():
-        found, lengths[name] = counted(test, {name: rows})
+    for name, group in groups.items():
+        found, lengths[name] = counted(test, {name: group})
         alone |= found
     for threads in (1, 2, 2):
         beside, steps = counted(dataclasses.replace(test, threads=threads), groups)
@@ -309,11 +342,14 @@ def test_a_group_beside_others_is_what_it_is_alone(
         assert steps == max(lengths.values())
         groups = dict(reversed(groups.items()))
     early = env != "point_robot_wind"
-    assert len(set(lengths.values())) == (3 if early else 1), lengths
+    assert len({lengths[name] for name in ("few", "one", "many")}) == (3 if early else 1), lengths
+    assert lengths["few"] > lengths["online"] > lengths["offline"]
     # That any of it could have differed:
     assert not same(alone["few"], dataclasses.replace(test, seed=SEED + 1).run(groups)["few"])
-    few, many = ([*groups[name]].index(4) for name in ("few", "many"))
+    few, many = ([*groups[name].rows].index(4) for name in ("few", "many"))
     assert alone["few"].returns[0, few] != alone["many"].returns[0, many]
+    for one, other in itertools.combinations(("few", "online", "offline"), 2):
+        assert (alone[one].returns != alone[other].returns).any(), (one, other)
 
 
 def test_what_is_called_before_each_step_can_end_it(encoder: CountingEncoder, actor: Actor) -> None:
@@ -324,7 +360,7 @@ def test_what_is_called_before_each_step_can_end_it(encoder: CountingEncoder, ac
 
     test = MetaTest(encoder, actor, task_set("point_robot_wind"), PROTOCOL, SEED)
     with pytest.raises(IndexError):
-        test.run({"some": ROWS}, count)
+        test.run({"some": Group(ROWS)}, count)
     # The first episode of 25 steps is scored, and five steps explore.
     assert len(encoder.given) == 5
     assert torch.is_grad_enabled()

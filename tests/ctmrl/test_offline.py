@@ -13,7 +13,7 @@ import torch
 
 from ctmrl.config import RunConfig
 from ctmrl.errors import UsageError
-from ctmrl.meta_test import MetaTest
+from ctmrl.meta_test import Group, MetaTest
 from ctmrl.networks import Actor, ContextEncoder, mean_encoding
 from ctmrl.offline import offline_contexts, open_data
 from ctmrl.presets import preset
@@ -67,7 +67,8 @@ def test_the_policy_is_scored_on_the_given_context(config: RunConfig) -> None:
     encoder = ContextEncoder((0.1 * ones, 0.5 * ones), 2, (11,), 5)
     actor = Actor((torch.zeros(2), torch.ones(2)), 5, (13,), 2)
     tasks, contexts = task_set("point_robot_wind"), given(config)
-    results = MetaTest(encoder, actor, tasks, config.meta_test, 0).run(GROUPS, given=contexts)
+    groups = {name: Group(rows, "offline", contexts[name]) for name, rows in GROUPS.items()}
+    results = MetaTest(encoder, actor, tasks, config.meta_test, 0).run(groups)
     for name, rows in GROUPS.items():
         with torch.no_grad():
             z = mean_encoding(encoder(contexts[name]))
@@ -84,20 +85,56 @@ def test_the_policy_is_scored_on_the_given_context(config: RunConfig) -> None:
             assert result.returns.flatten()[place] == pytest.approx(total, rel=1e-4)
 
 
-def test_the_command(wind_path: Path, commands: Commands, tmp_path: Path) -> None:
-    data, run = ("--data", str(wind_path)), tmp_path / "run"
-    train = ("ctmrl.train", "--preset", "smoke", "--steps", "20", "--validate", *data)
-    assert commands.run(*train, "--out", str(run)) == 0, commands.output()
-    words = ("ctmrl.evaluate", str(run), "--offline", *data)
+@pytest.fixture
+def run(wind_path: Path, commands: Commands, tmp_path: Path) -> Path:
+    """A run that learned from the dataset."""
+    path = tmp_path / "run"
+    train = ("ctmrl.train", "--preset", "smoke", "--steps", "20", "--validate")
+    words = (*train, "--data", str(wind_path), "--out", str(path))
+    assert commands.run(*words) == 0, commands.output()
+    return path
+
+
+def test_the_command(run: Path, wind_path: Path, commands: Commands, tmp_path: Path) -> None:
+    words = ("ctmrl.evaluate", str(run), "--protocols", "offline", "--data", str(wind_path))
     assert commands.run(*words, "--out", str(tmp_path / "a")) == 0, commands.output()
-    assert "ctmrl, offline contexts" in commands.output()
+    assert "ctmrl, offline, seed 0" in commands.output()
     assert commands.run(*words, "--out", str(tmp_path / "b")) == 0
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     assert sorted(contents(tmp_path / "a")) == ["contexts.png", "evaluation.json"]
     record = json.loads((tmp_path / "a" / "evaluation.json").read_text())
-    assert record["method"] == "ctmrl, offline contexts"
+    assert record["method"] == "ctmrl, offline"
+    assert record["protocol"]["name"] == "offline"
     assert record["protocol"]["random_episodes"] == record["protocol"]["policy_episodes"] == 0
     assert all(len(group["curve"]) == 1 for group in record["groups"].values())
+
+
+def test_all_protocols_in_one_pass(
+    run: Path, wind_path: Path, commands: Commands, tmp_path: Path
+) -> None:
+    words = ("ctmrl.evaluate", str(run), "--data", str(wind_path), "--protocols")
+    together, names = tmp_path / "together", ("offline", "np_online", "online")
+    assert commands.run(*words, *names, "--out", str(together)) == 0, commands.output()
+    for title in ("ctmrl, offline, seed 0", "ctmrl, seed 0", "ctmrl, online, seed 0"):
+        assert title in commands.output()
+    returns = set()
+    for name in names:
+        own = words if name == "offline" else (*words[:2], "--protocols")
+        assert commands.run(*own, name, "--out", str(tmp_path / name)) == 0, commands.output()
+        found = contents(together / name)
+        assert found == contents(tmp_path / name), name
+        record = json.loads(found["evaluation.json"])
+        assert record["protocol"]["name"] == name
+        returns.add(record["groups"]["unseen"]["return"])
+    assert len(returns) == 3
+    # np_online is what training ends with.
+    trained = contents(run)["evaluation.json"]
+    assert contents(together / "np_online")["evaluation.json"] == trained
+    explored = json.loads((together / "online" / "evaluation.json").read_text())["protocol"]
+    assert (explored["random_episodes"], explored["policy_episodes"]) == (0, 4)
+    # A report keeps them apart.
+    assert commands.run("ctmrl.report", str(together)) == 0, commands.output()
+    assert "ctmrl, offline" in commands.output()
 
 
 def test_tasks_without_data_are_named(config: RunConfig, good_path: Path) -> None:
@@ -109,7 +146,8 @@ def test_tasks_without_data_are_named(config: RunConfig, good_path: Path) -> Non
 def test_other_data_than_the_run_learned_from_are_refused(
     finished_run: FinishedRun, good_path: Path, commands: Commands
 ) -> None:
-    words = ("ctmrl.evaluate", str(finished_run.path), "--offline", "--data", str(good_path))
+    protocol = ("--protocols", "offline", "--data", str(good_path))
+    words = ("ctmrl.evaluate", str(finished_run.path), *protocol)
     assert commands.run(*words) == 2
     assert commands.output() == (
         f"error: {good_path} does not hold the data that the run learned from: "
@@ -120,9 +158,14 @@ def test_other_data_than_the_run_learned_from_are_refused(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--offline", "--fresh", "3"), "--offline is for tasks with data, and --fresh tasks have"),
-        (("--data", "somewhere"), "--data is for --offline: no other evaluation reads a dataset"),
-        (("--offline", "--data", "nowhere"), "nowhere"),
+        (
+            ("--protocols", "offline", "--fresh", "3"),
+            "--protocols offline is for tasks with data, and --fresh tasks have none",
+        ),
+        (("--data", "somewhere"), "--data is for --protocols offline: no other reads a dataset"),
+        (("--protocols", "offline", "--data", "nowhere"), "nowhere"),
+        (("--protocols", "online", "online"), "--protocols names one twice: online online"),
+        (("--protocols", "of"), "of"),
     ],
 )
 def test_options_that_do_not_fit(

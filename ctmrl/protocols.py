@@ -1,0 +1,7 @@
+"""The names of the meta-test's protocols; imports nothing, so that commands start quickly."""
+
+from typing import Literal
+
+Protocol = Literal["np_online", "online", "offline"]
+"""How contexts come about, by the names that the field's code (CSRO's) has: by episodes of random
+actions and then of the policy, of the deterministic policy alone, or by the task's own data."""
