@@ -214,8 +214,9 @@ def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
     _check_out(config)
     if config.fresh < 0:
         raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
-    if len({*config.protocols}) != len(config.protocols):
-        raise UsageError(f"--protocols names one twice: {' '.join(config.protocols)}")
+    if not config.protocols or len({*config.protocols}) != len(config.protocols):
+        said = " ".join(config.protocols) or "none"
+        raise UsageError(f"--protocols needs one or more, each once, got {said}")
     offline = "offline" in config.protocols
     if config.fresh and offline:
         raise UsageError("--protocols offline is for tasks with data, and --fresh tasks have none")

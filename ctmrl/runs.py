@@ -8,6 +8,7 @@ import io
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -133,9 +134,10 @@ def check_folder(path: Path, known: dict[str, Any], restart: bool) -> bool:
 
     Raises:
         RunError: the folder holds a run with other settings, something that is not a run, or a run
-            at work.
+            at work; or it cannot be written to.
     """
     if not path.exists():
+        _check_writable(next(above for above in path.parents if above.exists()), path)
         return False
     lock = _locked(path)
     try:
@@ -152,14 +154,24 @@ def check_folder(path: Path, known: dict[str, Any], restart: bool) -> bool:
         os.close(lock)
 
 
+def _unwritable(path: Path, error: OSError) -> RunError:
+    return RunError(f"{path} cannot be written to ({error.strerror}): choose another --out")
+
+
+def _check_writable(above: Path, path: Path) -> None:
+    """Refuse a folder to be made below one where nothing can be written."""
+    try:
+        tempfile.TemporaryFile(dir=above).close()
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
 def _locked(path: Path) -> int:
     """A handle of a folder, which is locked until it is closed."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
-        raise RunError(
-            f"{path} cannot be written to ({error.strerror}): choose another --out"
-        ) from None
+        raise _unwritable(path, error) from None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -224,9 +236,7 @@ class RunFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise RunError(
-                f"{path} cannot be written to ({error.strerror}): choose another --out"
-            ) from None
+            raise _unwritable(path, error) from None
         self._lock = _locked(path)
         try:
             self._begin(settings, restart)

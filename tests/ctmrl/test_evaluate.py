@@ -275,7 +275,7 @@ def test_an_output_folder_that_is_a_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # It is told before anything is computed.
-    monkeypatch.setattr("ctmrl.evaluate.evaluate_agent", None)
+    monkeypatch.setattr("ctmrl.evaluate.evaluate_protocols", None)
     (tmp_path / "out").write_text("")
     for out, why in (
         (tmp_path / "out", "File exists"),

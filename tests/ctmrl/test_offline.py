@@ -164,7 +164,8 @@ def test_other_data_than_the_run_learned_from_are_refused(
         ),
         (("--data", "somewhere"), "--data is for --protocols offline: no other reads a dataset"),
         (("--protocols", "offline", "--data", "nowhere"), "nowhere"),
-        (("--protocols", "online", "online"), "--protocols names one twice: online online"),
+        (("--protocols", "online", "online"), "one or more, each once, got online online"),
+        (("--protocols",), "one or more, each once, got none"),
         (("--protocols", "of"), "of"),
     ],
 )

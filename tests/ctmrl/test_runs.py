@@ -195,16 +195,15 @@ def test_what_is_refused_is_refused_before_the_settings_are_complete(
     with pytest.raises(RunError, match=r"tex cannot be written to \(.*\): choose another --out$"):
         check_folder(path / "thesis.tex", known, restart=False)
     # Nothing is kept locked.
-    (path / "thesis.tex").unlink()
-    (path / "evaluation.json").unlink()
-    (path / "checkpoint.pt").unlink()
+    for name in ("thesis.tex", "evaluation.json", "checkpoint.pt"):
+        (path / name).unlink()
     with opened(path):
         pass
 
 
 def test_what_a_kill_left_before_the_first_file_is_no_obstacle(path: Path) -> None:
     path.mkdir(parents=True)
-    (path / ".config.json.1.partial").write_bytes(b'{"sett')
+    (path / ".config.json.1.partial").write_bytes(b"{")
     with opened(path):
         assert os.listdir(path) == ["config.json"]
 
@@ -212,10 +211,11 @@ def test_what_a_kill_left_before_the_first_file_is_no_obstacle(path: Path) -> No
 def test_a_file_in_the_way_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "x").write_text("")
     for path in (tmp_path / "x", tmp_path / "x" / "y"):
-        with pytest.raises(
-            RunError, match=r"x(/y)? cannot be written to \(.*\): choose another --out$"
-        ):
-            RunFolder(path, SETTINGS, restart=False)
+        for refuse in (RunFolder, check_folder):
+            with pytest.raises(RunError, match=r"x(/y)? cannot be written to \(.*\): choose "):
+                refuse(path, SETTINGS, restart=False)
+    assert not check_folder(tmp_path / "a", {}, restart=False)
+    assert [*tmp_path.iterdir()] == [tmp_path / "x"]
 
 
 @pytest.mark.parametrize("content", [b"", b'{"settings": {"se', b"\xff\xfe\x00", b"[]", b"3"])
