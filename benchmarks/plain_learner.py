@@ -29,6 +29,8 @@ from datagen.dataset import TaskData
 
 Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """Observations, actions, rewards, next observations and terminals of n transitions."""
+Sampled = tuple[Tensor, Tensor, Tensor, Tensor]
+"""Actions of the policy, their log densities, and the means and log deviations behind them."""
 
 
 class Network(nn.Module):
@@ -137,14 +139,24 @@ class PlainLearner:
     def update(self) -> dict[str, Tensor]:
         """One gradient step; losses by name."""
         chosen = self.rng.permutation(len(self.tasks))[: self.training.meta_batch]
-        return self.step(self.sample_contexts(chosen), self.sample_batch(chosen))
+        contexts, batch = self.sample_contexts(chosen), self.sample_batch(chosen)
+        further = [self.sample_batch(chosen) for _ in range(1, self.actor_critic.batches)]
+        return self.step(contexts, batch, further)
 
-    def step(self, contexts: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """One gradient step on these data; losses by name."""
+    def step(
+        self, contexts: Tensor, batch: Batch, further: Sequence[Batch] = ()
+    ) -> dict[str, Tensor]:
+        """One gradient step on these data; losses by name.
+
+        Args:
+            contexts: two of each task.
+            batch: for the actor-critic.
+            further: batches for the dual critic's steps behind its first.
+        """
         z = self.encode(contexts)
         losses = self.context_losses(contexts, z[0], z[1])
         given = z[0].detach().repeat_interleave(self.training.batch_size, dim=0)
-        losses |= self.actor_critic_losses(batch, given)
+        losses |= self.actor_critic_losses(batch, given, further)
         weights = {
             "spe_prediction": 1.0,
             "cro_prediction": self.context.cross_prediction_weight,
@@ -232,7 +244,18 @@ class PlainLearner:
             total = total + (logits[k, group].logsumexp(dim=0) - logits[k, k]) / size
         return total / self.context.codes
 
-    def actor_critic_losses(self, batch: Batch, z: Tensor) -> dict[str, Tensor]:
+    def sample_actions(self, obs: Tensor, z: Tensor) -> Sampled:
+        """Actions that the policy draws."""
+        mean, log_std = self.networks["actor"](obs, z).chunk(2, dim=-1)
+        log_std = log_std.clamp(-20.0, 0.0)
+        noise = torch.randn(mean.shape, generator=self.generator)
+        drawn = torch.tanh(mean + log_std.exp() * noise)
+        density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
+        return drawn, (density - torch.log(1 - drawn.square() + 1e-6)).sum(dim=1), mean, log_std
+
+    def actor_critic_losses(
+        self, batch: Batch, z: Tensor, further: Sequence[Batch]
+    ) -> dict[str, Tensor]:
         """Losses of critics, value network and actor, in units of the scaled rewards."""
         config, networks = self.actor_critic, self.networks
         obs, action, reward, next_obs, terminal = batch
@@ -241,12 +264,7 @@ class PlainLearner:
             target = reward + config.gamma * (1 - terminal) * future
         q_data = [networks[name](obs, action, z)[:, 0] for name in ("critic_1", "critic_2")]
         critic = functional.mse_loss(q_data[0], target) + functional.mse_loss(q_data[1], target)
-        mean, log_std = networks["actor"](obs, z).chunk(2, dim=-1)
-        log_std = log_std.clamp(-20.0, 0.0)
-        noise = torch.randn(mean.shape, generator=self.generator)
-        drawn = torch.tanh(mean + log_std.exp() * noise)
-        density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
-        log_prob = (density - torch.log(1 - drawn.square() + 1e-6)).sum(dim=1)
+        drawn, log_prob, mean, log_std = self.sample_actions(obs, z)
         q_drawn = [networks[name](obs, drawn, z)[:, 0] for name in ("critic_1", "critic_2")]
         q = torch.min(q_drawn[0], q_drawn[1])
         entropy = 1 / config.reward_scale
@@ -257,7 +275,7 @@ class PlainLearner:
         actor = actor + entropy * config.regularizer * small
         losses = {"critic": critic, "value": value}
         if config.behavior_regularization:
-            losses["dual_critic"] = self.train_dual(obs, action, drawn.detach(), z)
+            losses["dual_critic"] = self.train_dual([batch, *further], drawn.detach(), z)
             divergence = self.divergence(obs, action, drawn, z)
             actor = actor + entropy * self.multiplier * divergence.mean()
             moved = self.multiplier + divergence.mean().detach() - config.divergence_target
@@ -270,7 +288,20 @@ class PlainLearner:
         at_data = functional.softplus(self.networks["dual"](obs, action, z)[:, 0])
         return torch.log(at_policy + 1e-8) - at_data + 1
 
-    def train_dual(self, obs: Tensor, action: Tensor, drawn: Tensor, z: Tensor) -> Tensor:
+    def train_dual(self, batches: Sequence[Batch], drawn: Tensor, z: Tensor) -> Tensor:
+        """A step of the dual critic on each batch; mean of its losses."""
+        all_drawn = [drawn]
+        if count := len(batches) - 1:
+            obs = torch.cat([batch[0] for batch in batches[1:]])
+            with torch.no_grad():
+                all_drawn += self.sample_actions(obs, z.repeat(count, 1))[0].chunk(count)
+        losses = [
+            self.step_dual(obs, action, drawn, z)
+            for (obs, action, *_), drawn in zip(batches, all_drawn, strict=True)
+        ]
+        return torch.stack(losses).mean()
+
+    def step_dual(self, obs: Tensor, action: Tensor, drawn: Tensor, z: Tensor) -> Tensor:
         """A step of the dual critic; its loss."""
         share = torch.rand(len(action), 1, generator=self.generator)
         between = self.networks["dual"](obs, drawn + share * (action - drawn), z)[:, 0]

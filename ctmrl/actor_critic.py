@@ -5,7 +5,7 @@ Contexts come in detached: no gradient of anything here reaches an encoder.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -50,6 +50,10 @@ class ActorCriticConfig:
     """What keeps the dual critic smooth: its value (the field's code) or its gradient (BRAC)."""
     dual_lr: float = 1e-4
     """Learning rate of the dual critic."""
+    dual_steps: int = 1
+    """Steps of the dual critic in each gradient step: the first on its batch, each further one on
+    another batch of the same tasks. The field's code takes 3. Of no use without
+    behavior_regularization."""
     behavior_cloning: float = 0.0
     """Weight of minus the log likelihood of the data's actions in the policy's loss, in units of
     the spread of Q: what TD3+BC is for a deterministic policy. 0 is without it."""
@@ -68,6 +72,11 @@ class ActorCriticConfig:
     """Let critics and value network begin at the value that the data's mean reward comes to, and
     not at 0, from where they take thousands of steps."""
 
+    @property
+    def batches(self) -> int:
+        """Batches of a gradient step: one for each step of the dual critic where there is one."""
+        return self.dual_steps if self.behavior_regularization else 1
+
 
 class ActorCritic(nn.Module):
     """Actor, twin critics, value network and, for BRAC, a dual critic.
@@ -76,7 +85,8 @@ class ActorCritic(nn.Module):
     entropy weight 1, and the networks' outputs stay of the size of a discounted return.
 
     Actor, critics and value network share no parameter, so the sum of their losses trains all of
-    them in one backward pass; the dual critic has an optimiser of its own and is updated first.
+    them in one backward pass; the dual critic has an optimiser of its own and takes all its steps
+    first.
     """
 
     def __init__(
@@ -135,7 +145,11 @@ class ActorCritic(nn.Module):
         return [parameter for module in modules for parameter in module.parameters()]
 
     def loss(
-        self, batch: Transitions, z: Tensor, generator: Source
+        self,
+        batch: Transitions,
+        z: Tensor,
+        generator: Source,
+        further: Sequence[Transitions] = (),
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Losses of critics, value network and actor; with BRAC, also updates the dual critic.
 
@@ -143,6 +157,7 @@ class ActorCritic(nn.Module):
             batch: n transitions.
             z: context of each transition's task, [n, Z], detached.
             generator: of the policy's noise.
+            further: batches of the same tasks in the same order, for the dual critic alone.
 
         Returns:
             Scalar sum of the losses, and scalars by metric name.
@@ -180,9 +195,8 @@ class ActorCritic(nn.Module):
         if cloning:
             metrics["loss/behavior_cloning"] = unlikely.detach()
         if self.multiplier is not None:
-            metrics["loss/dual_critic"] = self._update_dual(
-                batch, z, sample.action.detach(), generator
-            )
+            batches, action = (batch, *further), sample.action.detach()
+            metrics["loss/dual_critic"] = self._train_dual(batches, z, action, generator)
             divergence = self._divergence(batch, z, sample.action)
             coefficient = self.multiplier.coefficient()
             actor = actor + self.entropy_coef * coefficient * divergence.mean()
@@ -227,6 +241,25 @@ class ActorCritic(nn.Module):
         at_policy = self.dual_critic(batch.obs, action, z, layers=layers)[0]
         at_data = self.dual_critic(batch.obs, batch.action, z, layers=layers)[0]
         return brac.dual_divergence(at_policy, at_data)
+
+    def _train_dual(
+        self, batches: Sequence[Transitions], z: Tensor, action: Tensor, generator: Source
+    ) -> Tensor:
+        """A step of the dual critic on each batch; mean of its losses.
+
+        Args:
+            batches: of n transitions each.
+            z: context of each transition's task in all of them, [n, Z].
+            action: the policy's at the first batch, [n, A].
+            generator: of what is drawn, first the policy's noise at all further batches.
+        """
+        actions = [action]
+        if further := batches[1:]:
+            with torch.no_grad():
+                obs, repeated = torch.cat([one.obs for one in further]), z.repeat(len(further), 1)
+                actions += self.actor.sample(obs, repeated, generator).action.chunk(len(further))
+        pairs = zip(batches, actions, strict=True)
+        return torch.stack([self._update_dual(one, z, at, generator) for one, at in pairs]).mean()
 
     def _update_dual(
         self, batch: Transitions, z: Tensor, action: Tensor, generator: Source

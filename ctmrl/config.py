@@ -125,7 +125,7 @@ _WEIGHTS = (
 )
 _BOUNDS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("steps", "batch_size", "context_episodes", "context_size"), (1, math.inf)),
-    **dict.fromkeys(("scored_episodes", "repetitions", "z_dim"), (1, math.inf)),
+    **dict.fromkeys(("scored_episodes", "repetitions", "z_dim", "dual_steps"), (1, math.inf)),
     # Far more of them, and the libraries crash.
     "threads": (1, 1024),
     **dict.fromkeys(("hidden", "encoder_hidden", "predictor_hidden"), (1, math.inf)),

@@ -39,6 +39,12 @@ class Transitions(NamedTuple):
     rank: Tensor
 
 
+def split_batches(drawn: Transitions, tasks: int, batches: int) -> list[Transitions]:
+    """Batches of n transitions a task, [tasks * n, ...], of tasks * batches * n, task by task."""
+    columns = [one.view(tasks, batches, -1, *one.shape[1:]).unbind(1) for one in drawn]
+    return [Transitions(*(x.flatten(0, 1) for x in parts)) for parts in zip(*columns, strict=True)]
+
+
 @dataclass(frozen=True)
 class _Layout:
     """Which columns of the table hold what."""

@@ -12,7 +12,7 @@ from ctmrl.actor_critic import ActorCritic
 from ctmrl.agent import Agent, build_method, part
 from ctmrl.codebook import SHARE
 from ctmrl.config import MetaTrainConfig, RunConfig
-from ctmrl.data import OfflineData
+from ctmrl.data import OfflineData, split_batches
 from ctmrl.errors import UsageError
 from ctmrl.methods.base import Dimensions
 from ctmrl.networks import mean_encoding
@@ -97,6 +97,7 @@ class Learner:
             for name, optimizer in self.optimizers.items()
         }
         self._every = torch.arange(len(data))
+        self._rows = policy.batches * config.training.batch_size
         self._numbers = Numbers(self.generator, self.device)
         self._recorded: RecordedStep | None = None
         if self.device.type == "cuda":
@@ -148,7 +149,7 @@ class Learner:
             tasks, sets = self._draw_tasks(ahead), self.method.context_sets
             size = (config.context_episodes, config.context_size)
             self.data.page_in(self.data.context_rows(tasks, sets, *size, ahead))
-            self.data.page_in(self.data.batch_rows(tasks, config.batch_size, ahead))
+            self.data.page_in(self.data.batch_rows(tasks, self._rows, ahead))
 
     def update(self, look: Callable[[dict[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
         """One gradient step.
@@ -164,7 +165,7 @@ class Learner:
         tasks = self._draw_tasks(self.generator)
         given = Given(
             self._draw(tasks, self.method.context_sets),
-            self.data.transitions(tasks, self.config.batch_size, self.generator),
+            self.data.transitions(tasks, self._rows, self.generator),
             self.data.params[tasks],
         )
         if self._recorded is None or look is not None:
@@ -192,7 +193,7 @@ class Learner:
         Returns:
             Scalars by metric name; and all the step is made of, in the order it came about.
         """
-        contexts, batch, params = given
+        contexts, rows, params = given
         with products_in(self.precision):
             encodings = self.method.encoder(contexts)
             context_loss, metrics = self.method.context_loss(contexts, encodings, source)
@@ -200,7 +201,8 @@ class Learner:
             z = mean_encoding(encodings.detach())
             told = self.method.encoder.told(z[0], params)
             repeated = told.repeat_interleave(self.config.batch_size, dim=0)
-            policy_loss, more = self.actor_critic.loss(batch, repeated, source)
+            batch, *further = split_batches(rows, len(told), self.actor_critic.config.batches)
+            policy_loss, more = self.actor_critic.loss(batch, repeated, source, further)
         drawn()
         loss = context_loss + policy_loss
         self.optimizers["main"].zero_grad()
@@ -208,7 +210,7 @@ class Learner:
         self.optimizers["main"].step()
         self.actor_critic.follow_value()
         metrics |= _spread(z) | more
-        data = {f"data/{name}": values for name, values in batch._asdict().items()}
+        data = {f"data/{name}": values for name, values in rows._asdict().items()}
         made = {"data/context": contexts, **data, "contexts": z, **metrics, "loss": loss}
         return metrics, made
 

@@ -63,6 +63,7 @@ PAPER_ROBOT = PAPER | {
     "timeouts_as_terminals": True,
     "behavior_regularization": True,
     "divergence_wind_up": True,
+    "dual_steps": 3,
     # 600 steps as in the field's code, half of them random and no fewer.
     "random_episodes": 2,
     "policy_episodes": 1,

@@ -18,7 +18,8 @@ class Given(NamedTuple):
 
     Attributes:
         contexts: [sets, B, n, O + A + 1 + O], transitions (s, a, r, s').
-        batch: for the actor-critic, task by task.
+        batch: for the actor-critic, task by task; of each task as many rows as all of the step's
+            batches have.
         params: [B, P], true parameters of the tasks.
     """
 

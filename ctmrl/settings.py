@@ -15,6 +15,7 @@ LATER_SETTINGS: dict[str, Any] = {
         "cloning_rank": 0.0,
         "value_expectile": 0.0,
         "value_from_data": False,
+        "dual_steps": 1,
     },
 }
 """Settings that came after the first runs, and what a run has that does not name them. Where they

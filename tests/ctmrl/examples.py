@@ -108,6 +108,14 @@ def smoke(steps: int = 20, method: str = "ctmrl", **changes: Any) -> RunConfig:
     return dataclasses.replace(config, training=training)
 
 
+def with_dual_steps(config: RunConfig, steps: int, brac: bool = True) -> RunConfig:
+    """A run with so many steps of the dual critic; `brac` is whether it has one."""
+    changed = dataclasses.replace(
+        config.actor_critic, behavior_regularization=brac, dual_steps=steps
+    )
+    return dataclasses.replace(config, actor_critic=changed)
+
+
 @dataclass(frozen=True, eq=False)
 class HandMade(Dataset):
     """A dataset that is not on a disk, for what no environment here produces.

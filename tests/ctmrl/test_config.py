@@ -69,6 +69,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("cloning_rank", -1.0, "at least 0"),
     ("value_expectile", 1.5, "from 0 to 1"),
     ("divergence_maximum", -1.0, "at least 0"),
+    ("dual_steps", 0, "at least 1"),
     ("contrast_weight", -0.1, "at least 0"),
     ("z_dim", 0, "at least 1"),
     ("tau", 0.0, "at least 1e-09"),

@@ -18,15 +18,18 @@ from ctmrl.data import OfflineData
 from ctmrl.meta_train import Learner
 from ctmrl.table import Room
 from datagen.dataset import TaskData, open_dataset, task_file, write_index, write_task
+from tests.ctmrl.examples import with_dual_steps
 from tests.ctmrl.test_meta_train import STEPS, assert_same, config_of, frozen, train
 from tests.datagen.examples import index_of, task_data
 
 TILES, TASKS = 4_500, (0, 1, 3, 4)
 
 
-@pytest.fixture(params=[("ctmrl", False), ("ctmrl", True), ("focal", True)], ids=str)
+@pytest.fixture(params=[("ctmrl", 0), ("ctmrl", 1), ("focal", 1), ("ctmrl", 3)], ids=str)
 def config(request: pytest.FixtureRequest) -> RunConfig:
-    return config_of(*request.param)
+    """With so many steps of the dual critic; 0 is without one."""
+    method, steps = request.param
+    return with_dual_steps(config_of(method), max(steps, 1), steps > 0)
 
 
 @pytest.fixture

@@ -250,9 +250,9 @@ def test_a_step_draws_different_tasks_and_their_contexts_belong_to_their_rows(
         tasks.append(asked)
         return transitions(asked, *rest)
 
-    def spied_loss(batch: Any, z: Tensor, generator: torch.Generator) -> Any:
+    def spied_loss(batch: Any, z: Tensor, *rest: Any) -> Any:
         seen.append((tasks[-1], batch.obs, z))
-        return loss(batch, z, generator)
+        return loss(batch, z, *rest)
 
     monkeypatch.setattr(learner.data, "contexts", spied_contexts)
     monkeypatch.setattr(learner.data, "transitions", spied_transitions)

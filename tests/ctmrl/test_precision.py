@@ -202,7 +202,9 @@ def test_a_weight_is_cast_once_for_a_call_and_critics_calls_share(
         if name.endswith((".weights.3", ".biases.3")):
             wanted = 0  # a critic's last layer
         elif "dual_critic" in name:
-            wanted = 2  # before its step and after
+            wanted = 4  # before each of its three steps and after them
+        elif ".actor." in name:
+            wanted = 2  # with its gradient, and without it at all further batches
         elif "codebook" in name:
             wanted = 0
         elif method == "ctmrl_released" and ("encoder" in name or "predictors" in name):

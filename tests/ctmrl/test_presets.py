@@ -20,6 +20,7 @@ from ctmrl.methods.ctmrl import CTMRLConfig
 from ctmrl.methods.ctmrl_released import CTMRLReleasedConfig
 from ctmrl.presets import OF_METHODS, ROWS, SMOKE, config_from_settings, known_preset, preset
 from ctmrl.runs import to_json
+from ctmrl.settings import without_later_settings
 from datagen.budgets import budget
 from meta_envs import ENVIRONMENTS, task_set
 from tests.meta_envs.robots import POINT_ROBOTS
@@ -95,6 +96,7 @@ def test_the_fields_settings_for_robots() -> None:
         assert (actor_critic.gamma, actor_critic.reward_scale) == (0.99, 5.0)
         assert (actor_critic.behavior_regularization, actor_critic.dual_penalty) == (True, "value")
         assert actor_critic.divergence_wind_up
+        assert actor_critic.dual_steps == 3
         assert actor_critic.timeouts_as_terminals
         assert (actor_critic.hidden, actor_critic.learning_rate) == ((256, 256, 256), 3e-4)
         found[env] = (
@@ -133,6 +135,25 @@ def test_the_multiplier_winds_up_in_the_released_reading_and_where_the_field_is_
     robots_of_the_field = config.preset == "paper" and config.env not in POINT_ROBOTS
     wanted = config.method == "ctmrl_released" or robots_of_the_field
     assert config.actor_critic.divergence_wind_up is wanted
+
+
+def test_the_dual_critic_has_the_fields_steps_wherever_there_is_one(config: RunConfig) -> None:
+    robots_of_the_field = config.preset == "paper" and config.env not in POINT_ROBOTS
+    assert config.actor_critic.behavior_regularization is robots_of_the_field
+    assert config.actor_critic.dual_steps == (3 if robots_of_the_field else 1)
+
+
+def test_a_run_from_before_the_dual_critics_steps_were_an_option_has_one() -> None:
+    config = preset("half_cheetah_vel", "ctmrl", "paper", precision="float32")
+    stored = through_a_file(config)
+    del stored["settings"]["actor_critic"]["dual_steps"]
+    one = dataclasses.replace(config.actor_critic, dual_steps=1)
+    found = config_from_settings(stored, PATH)
+    assert found == dataclasses.replace(config, actor_critic=one)
+    # And its file, written anew, stays what it is.
+    assert without_later_settings(through_a_file(found)["settings"]) == without_later_settings(
+        stored["settings"]
+    )
 
 
 def test_every_environment_has_presets() -> None:

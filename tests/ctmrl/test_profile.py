@@ -34,7 +34,7 @@ from ctmrl.profile import (
     watched,
 )
 from tests.ctmrl.commands import Commands
-from tests.ctmrl.examples import smoke
+from tests.ctmrl.examples import smoke, with_dual_steps
 
 
 @pytest.fixture
@@ -110,6 +110,17 @@ def test_the_flops_are_those_of_the_layers(learner: Learner) -> None:
     contexts = 2 * training.meta_batch * training.context_size
     assert flops["encoder, forward"] == 2 * contexts * weights(method.encoder)
     assert flops["sampling"] == flops["optimisers"] == 0
+
+
+def test_the_flops_of_the_dual_critics_steps(wind_data: OfflineData) -> None:
+    learner = Learner(with_dual_steps(smoke(steps=1_000), 3), wind_data)
+    flops, training, actor_critic = count_flops(learner), learner.config, learner.actor_critic
+    rows = training.meta_batch * training.batch_size
+    # At the policy's actions, the data's and those between in each step, and twice after them.
+    passes = 3 * 3 + 2
+    dual = 2 * passes * rows * weights(actor_critic.dual_critic)
+    assert flops["dual critic, forward"] == dual
+    assert flops["actor, forward"] == 3 * 2 * rows * weights(actor_critic.actor)
 
 
 def test_the_table_fits_a_terminal_and_adds_up() -> None:

@@ -39,11 +39,14 @@ def config(method: str, precision: str = "float32", decay: bool = False) -> RunC
     """With behaviour regularisation, and rates that float32 has exactly.
 
     `oracle_task` also clones and learns the value of the data's actions, as AntGoal's presets do.
+    `focal`, and what is in bfloat16, takes three steps of the dual critic.
     """
     made = config_of(method, brac=True, precision=precision, steps=STEPS, decay=decay)
     rates: dict[str, Any] = {"learning_rate": 2.0**-10, "dual_lr": 2.0**-11}
     if method == "oracle_task":
         rates |= {"behavior_cloning": 5.0, "cloning_advantage": 3.0, "value_expectile": 0.8}
+    if method == "focal" or precision == "bfloat16":
+        rates["dual_steps"] = 3
     return dataclasses.replace(
         made,
         context=dataclasses.replace(made.context, encoder_lr=2.0**-9),
@@ -174,10 +177,9 @@ def place(learner: Learner, placed: bool) -> None:
 
 def given(learner: Learner) -> Given:
     tasks = learner._draw_tasks(learner.generator)
-    size = learner.config.batch_size
     return Given(
         learner._draw(tasks, learner.method.context_sets),
-        learner.data.transitions(tasks, size, learner.generator),
+        learner.data.transitions(tasks, learner._rows, learner.generator),
         learner.data.params[tasks],
     )
 

@@ -269,7 +269,9 @@ def test_the_command_line(words: list[str], wanted: RunConfig) -> None:
 def test_the_ablations_and_other_switches_of_the_command_line() -> None:
     ablations = "--no-code-contrast --no-cross-prediction --no-kmeans --no-contrast"
     sizes = "--codes 3 --encoder-hidden 5 7 --hidden 11 --no-decay"
-    brac = "--behavior-regularization --dual-penalty gradient --timeouts-as-terminals"
+    brac = (
+        "--behavior-regularization --dual-penalty gradient --dual-steps 2 --timeouts-as-terminals"
+    )
     config = parse(f"{ablations} {sizes} {brac}".split())
     context = config.context
     assert isinstance(context, CTMRLConfig)
@@ -279,6 +281,7 @@ def test_the_ablations_and_other_switches_of_the_command_line() -> None:
     assert config.actor_critic.hidden == (11,)
     assert config.actor_critic.behavior_regularization
     assert config.actor_critic.dual_penalty == "gradient"
+    assert config.actor_critic.dual_steps == 2
     assert config.actor_critic.timeouts_as_terminals
     assert not config.training.decay
     default = parse(["--method", "focal", "--metric-weight", "3"]).context

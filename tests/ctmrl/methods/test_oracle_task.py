@@ -53,9 +53,9 @@ def test_all_transitions_of_a_task_have_its_parameters_and_no_other_tasks(
     loss, draw = learner.actor_critic.loss, wind_data.transitions
     asked: list[Tensor] = []
 
-    def spied_loss(batch: Any, z: Tensor, generator: torch.Generator) -> Any:
+    def spied_loss(batch: Any, z: Tensor, *rest: Any) -> Any:
         given.append(z)
-        return loss(batch, z, generator)
+        return loss(batch, z, *rest)
 
     def spied_transitions(tasks: Tensor, *rest: Any) -> Any:
         asked.append(tasks)
