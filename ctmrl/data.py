@@ -40,7 +40,7 @@ class Transitions(NamedTuple):
 
 
 def split_batches(drawn: Transitions, tasks: int, batches: int) -> list[Transitions]:
-    """Batches of n transitions a task, [tasks * n, ...], of tasks * batches * n, task by task."""
+    """Split rows [tasks * batches * n, ...], task by task, into batches [tasks * n, ...]."""
     columns = [one.view(tasks, batches, -1, *one.shape[1:]).unbind(1) for one in drawn]
     return [Transitions(*(x.flatten(0, 1) for x in parts)) for parts in zip(*columns, strict=True)]
 

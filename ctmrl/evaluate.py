@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,10 +32,9 @@ class EvaluateConfig:
     fresh: int = 0
     """Instead of the dataset's tasks, this many fresh ones from the same distribution."""
     protocols: tuple[Protocol, ...] = ("np_online",)
-    """How contexts come about, one or more, all in one pass: np_online explores at random and then
-    with the policy, as training's own meta-test does; online with the deterministic policy alone;
-    offline not at all, its contexts are of the tasks' own data, so that the dataset must have the
-    test tasks."""
+    """Which meta-tests, one or more, all in one pass. np_online, training's own: random episodes,
+    then the stochastic policy's. online: as many episodes of the deterministic policy. offline: no
+    exploration, contexts are of the tasks' own data, so the dataset must have the test tasks."""
     data: Path | None = None
     """Dataset folder for offline contexts, of the data that the run learned from; default
     datasets/<environment>."""
@@ -43,8 +42,8 @@ class EvaluateConfig:
     """Of exploration and of the offline contexts, and of the fresh tasks; the run's own seed by
     default."""
     out: Path | None = None
-    """Also write the result as JSON and its pictures into this folder; of several protocols into a
-    folder of its name in there each."""
+    """Also write the result as JSON and its pictures into this folder; with several protocols, into
+    a sub-folder for each, named after it."""
     repetitions: int | None = field(default=None)
     """Independent adaptations of each task; the run's own number by default."""
     unfinished: bool = False
@@ -98,6 +97,12 @@ def evaluate_protocols(  # noqa: PLR0913 - each decides what is measured
 
     threads = own_cores(config)
     references = reference_returns(tasks, threads=threads)
+    anchors: dict[str, dict[str, float]] = {}
+    for name, rows in groups.items():
+        anchors[name] = {key: float(values[rows].mean()) for key, values in references.items()}
+        if best_behavior and all(int(row) in best_behavior for row in rows):
+            best = [best_behavior[int(row)] for row in rows]
+            anchors[name]["best_behavior"] = sum(best) / len(best)
     test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed, threads)
     asked = {
         f"{protocol}/{name}": Group(rows, protocol, None if data is None else data[name])
@@ -107,33 +112,28 @@ def evaluate_protocols(  # noqa: PLR0913 - each decides what is measured
     results = test.run(asked)
     records: dict[Protocol, dict[str, Any]] = {}
     for protocol in protocols:
-        record: dict[str, Any] = {
+        records[protocol] = {
             "env": config.env,
             "method": config.label if protocol == "np_online" else f"{config.label}, {protocol}",
             "seed": config.seed,
             "evaluation_seed": seed,
-            "protocol": _protocol(protocol, config),
+            "protocol": _described(protocol, config),
             "param_names": list(tasks.param_names),
-            "groups": {},
+            "groups": {
+                name: {
+                    "tasks": rows.tolist(),
+                    "params": tasks.params[rows].tolist(),
+                    **_scored(agent, results[f"{protocol}/{name}"], anchors[name]),
+                }
+                for name, rows in groups.items()
+            },
         }
         if agent.method.note:
-            record["note"] = agent.method.note
-        for name, rows in groups.items():
-            anchors = {key: float(values[rows].mean()) for key, values in references.items()}
-            if best_behavior and all(int(row) in best_behavior for row in rows):
-                best = [best_behavior[int(row)] for row in rows]
-                anchors["best_behavior"] = sum(best) / len(best)
-            result = results[f"{protocol}/{name}"]
-            record["groups"][name] = {
-                "tasks": rows.tolist(),
-                "params": tasks.params[rows].tolist(),
-                **_scored(agent, result, anchors),
-            }
-        records[protocol] = record
+            records[protocol]["note"] = agent.method.note
     return records
 
 
-def _protocol(protocol: Protocol, config: RunConfig) -> dict[str, Any]:
+def _described(protocol: Protocol, config: RunConfig) -> dict[str, Any]:
     """A protocol's name, and how much of everything it has."""
     import dataclasses
 
@@ -166,39 +166,43 @@ def _scored(agent: Agent, result: MetaTestResult, anchors: dict[str, float]) -> 
     }
 
 
-def _check_out(config: EvaluateConfig) -> None:
-    """Refuse an output folder that holds a run, whose evaluation would be written over."""
-    from ctmrl import runs
-    from ctmrl.errors import UsageError
-
-    if config.out is not None and (config.out / runs.CONFIG).exists():
-        whose = "the run itself" if config.out.resolve() == config.run.resolve() else "another run"
-        raise UsageError(f"--out {config.out} is {whose}: choose another folder")
-
-
 def _folders(config: EvaluateConfig) -> dict[Protocol, Path]:
-    """Make each protocol's folder, if any, and be sure that files can be written there.
+    """Each protocol's folder, if any; one that holds a run is refused, it would be written over.
 
     Raises:
-        UsageError: they cannot.
+        UsageError: it does.
     """
-    import tempfile
-
+    from ctmrl import runs
     from ctmrl.errors import UsageError
 
     if config.out is None:
         return {}
     several = len(config.protocols) > 1
     folders = {one: config.out / one if several else config.out for one in config.protocols}
-    for folder in folders.values():
+    for folder in (config.out, *folders.values()):
+        if (folder / runs.CONFIG).exists():
+            whose = "the run itself" if folder.resolve() == config.run.resolve() else "another run"
+            raise UsageError(f"--out {folder} is {whose}: choose another folder")
+    return folders
+
+
+def _make(folders: Iterable[Path]) -> None:
+    """Make folders, and be sure that files can be written there.
+
+    Raises:
+        UsageError: they cannot.
+    """
+    from ctmrl.errors import UsageError
+    from ctmrl.runs import check_writable
+
+    for folder in folders:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=folder).close()
+            check_writable(folder)
         except OSError as error:
             raise UsageError(
-                f"--out {config.out} cannot be written to ({error.strerror}): choose another folder"
+                f"--out {folder} cannot be written to ({error.strerror}): choose another folder"
             ) from None
-    return folders
 
 
 def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
@@ -211,7 +215,6 @@ def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
 
     from ctmrl.errors import UsageError
 
-    _check_out(config)
     if config.fresh < 0:
         raise UsageError(f"--fresh must be at least 0, got {config.fresh}")
     if not config.protocols or len({*config.protocols}) != len(config.protocols):
@@ -223,8 +226,8 @@ def _settings(config: EvaluateConfig, run: RunConfig) -> RunConfig:
     if config.data is not None and not offline:
         raise UsageError("--data is for --protocols offline: no other reads a dataset")
     if config.repetitions is not None:
-        protocol = dataclasses.replace(run.meta_test, repetitions=config.repetitions)
-        run = dataclasses.replace(run, meta_test=protocol)
+        meta_test = dataclasses.replace(run.meta_test, repetitions=config.repetitions)
+        run = dataclasses.replace(run, meta_test=meta_test)
     return dataclasses.replace(run, data=config.data)
 
 
@@ -258,6 +261,7 @@ def main(config: EvaluateConfig) -> None:
     from datagen.dataset import write_whole
     from meta_envs import task_set
 
+    folders = _folders(config)
     stored = runs.read_json(config.run / runs.CONFIG)
     run_config = _settings(config, config_from_settings(stored, config.run / runs.CONFIG))
     seed = run_config.seed if config.seed is None else config.seed
@@ -285,7 +289,7 @@ def main(config: EvaluateConfig) -> None:
         one: offline_contexts(run_config, groups, seed, learned_from) if one == "offline" else None
         for one in config.protocols
     }
-    folders = _folders(config)
+    _make(folders.values())
     records = evaluate_protocols(agent, run_config, tasks, groups, best, seed, protocols)
     console = Console()
     if step < dims.steps:

@@ -155,26 +155,25 @@ class _Adaptation:
         """Returns [n] of one deterministic episode on the contexts so far."""
         return self.episode(self.deterministic(self.z), explore=False)
 
-    def explored(self, protocol: Protocol, config: MetaTestConfig) -> Exploration:
-        """Fill the contexts; the returns [n] of a deterministic episode before each episode."""
+    def explore(self, protocol: Protocol, config: MetaTestConfig) -> Exploration:
+        """Fill the contexts; gives the returns [n] that the curve has before its last."""
         curve: list[Floats] = []
-        if protocol == "offline":
-            return curve
-        for episode in range(config.random_episodes + config.policy_episodes):
-            if protocol == "online":
+        episodes = config.random_episodes + config.policy_episodes
+        if protocol == "online":
+            for _ in range(episodes):
                 act = self.deterministic(self.z)
                 curve.append((yield from self.episode(act, explore=True)))
-                continue
-            curve.append((yield from self.score()))
-            if episode < config.random_episodes:
-                yield from self.episode(self.random, explore=True)
-            else:
-                yield from self.episode(self.stochastic(self.z), explore=True)
+        elif protocol == "np_online":
+            for number in range(episodes):
+                curve.append((yield from self.score()))
+                random = number < config.random_episodes
+                act = self.random if random else self.stochastic(self.z)
+                yield from self.episode(act, explore=True)
         return curve
 
     def episodes(self, protocol: Protocol, config: MetaTestConfig) -> Episodes:
         """The whole adaptation."""
-        curve = yield from self.explored(protocol, config)
+        curve = yield from self.explore(protocol, config)
         last = []
         for _ in range(config.scored_episodes):
             last.append((yield from self.score()))
@@ -223,7 +222,13 @@ class MetaTest:
         Args:
             groups: tasks and protocols by name.
             each_step: called before each step; what it raises ends the meta-test.
+
+        Raises:
+            ValueError: an offline group without data, or another one with data.
         """
+        for name, group in groups.items():
+            if (group.protocol == "offline") != (group.data is not None):
+                raise ValueError(f"group {name!r}: offline contexts need data, no others take any")
         repetitions = self.config.repetitions
         rows = {name: np.tile(group.rows, repetitions) for name, group in groups.items()}
         every = np.concatenate([*rows.values()])
@@ -231,30 +236,32 @@ class MetaTest:
         env.reset(seed=[self.seed + place for own in rows.values() for place in range(len(own))])
         dense = self.encoder.sees_dense_reward and env.definition.sparse
         actions = np.zeros(env.action_space.shape or (), dtype=np.float32)
-        at_work: list[tuple[str, slice, Episodes]] = []
+        at_work: dict[str, tuple[_Adaptation, Episodes]] = {}
+        begin = 0
         for name, group in groups.items():
-            begin = at_work[-1][1].stop if at_work else 0
             place = slice(begin, begin + len(rows[name]))
+            begin = place.stop
             adaptation = _Adaptation(env, place, self)
             if group.data is not None:
                 adaptation.read(group.data)
             episodes = adaptation.episodes(group.protocol, self.config)
             actions[place] = next(episodes)
-            at_work.append((name, place, episodes))
+            at_work[name] = adaptation, episodes
         results: dict[str, MetaTestResult] = {}
-        while len(results) < len(groups):
+        while at_work:
             if each_step is not None:
                 each_step()
             obs, reward, terminated, truncated, info = env.step(actions)
             read, over = info["dense_reward"] if dense else reward, terminated | truncated
-            for name, place, episodes in at_work:
-                if name in results:
-                    continue
+            for name, (adaptation, episodes) in [*at_work.items()]:
+                place = adaptation.rows
                 seen = _Seen(obs[place], reward[place], read[place], over[place])
                 try:
                     actions[place] = episodes.send(seen)
                 except StopIteration as stop:
                     results[name] = stop.value
+                    env.rest(adaptation.mask)
+                    del at_work[name]
         return {name: results[name] for name in groups}
 
 

@@ -97,7 +97,7 @@ class Learner:
             for name, optimizer in self.optimizers.items()
         }
         self._every = torch.arange(len(data))
-        self._rows = policy.batches * config.training.batch_size
+        self._rows_a_task = policy.batches * config.training.batch_size
         self._numbers = Numbers(self.generator, self.device)
         self._recorded: RecordedStep | None = None
         if self.device.type == "cuda":
@@ -149,7 +149,7 @@ class Learner:
             tasks, sets = self._draw_tasks(ahead), self.method.context_sets
             size = (config.context_episodes, config.context_size)
             self.data.page_in(self.data.context_rows(tasks, sets, *size, ahead))
-            self.data.page_in(self.data.batch_rows(tasks, self._rows, ahead))
+            self.data.page_in(self.data.batch_rows(tasks, self._rows_a_task, ahead))
 
     def update(self, look: Callable[[dict[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
         """One gradient step.
@@ -165,7 +165,7 @@ class Learner:
         tasks = self._draw_tasks(self.generator)
         given = Given(
             self._draw(tasks, self.method.context_sets),
-            self.data.transitions(tasks, self._rows, self.generator),
+            self.data.transitions(tasks, self._rows_a_task, self.generator),
             self.data.params[tasks],
         )
         if self._recorded is None or look is not None:

@@ -162,7 +162,7 @@ SMOKE: Settings = {
 }
 """What every environment's smoke preset has on top of its standard one."""
 
-OF_METHODS: dict[str, Settings] = {"ctmrl_released": {"divergence_wind_up": True}}
+OF_METHODS: dict[str, Settings] = {"ctmrl_released": {"divergence_wind_up": True, "dual_steps": 3}}
 """What a method has in every preset of every environment on top of those."""
 
 ROWS: dict[str, Row] = {

@@ -129,7 +129,7 @@ def parts_of(learner: Learner) -> list[tuple[Any, str, str]]:
         (learner.data, "transitions", "sampling"),
         (method, "context_loss", "context losses"),
         (actor_critic, "loss", "actor-critic losses"),
-        (actor_critic, "_update_dual", "dual critic's losses"),
+        (actor_critic, "_train_dual", "dual critic's losses"),
         (actor_critic, "follow_value", "target value's step"),
         (torch.Tensor, "backward", "backward"),
     ]

@@ -44,16 +44,16 @@ def measure_of(config: RunConfig, learner: Learner) -> Measure:
     Beside training that is a copy of the agent, on the cores that are spare. An agent that
     exploration cannot change is measured without it.
     """
-    protocol = dataclasses.replace(config.meta_test, repetitions=1)
+    meta_test = dataclasses.replace(config.meta_test, repetitions=1)
     if not learner.method.explores:
-        protocol = dataclasses.replace(protocol, random_episodes=0, policy_episodes=0)
+        meta_test = dataclasses.replace(meta_test, random_episodes=0, policy_episodes=0)
     beside = measured_beside(config)
     agent = copy.deepcopy(learner.agent) if beside else learner.agent
     test = MetaTest(
         agent.method.encoder,
         agent.actor,
         task_set(config.env),
-        protocol,
+        meta_test,
         config.seed,
         max(spare_cores(config), 1) if beside else own_cores(config),
     )

@@ -134,10 +134,13 @@ def check_folder(path: Path, known: dict[str, Any], restart: bool) -> bool:
 
     Raises:
         RunError: the folder holds a run with other settings, something that is not a run, or a run
-            at work; or it cannot be written to.
+            at work; or it cannot be written to or made.
     """
+    try:
+        check_writable(next(there for there in (path, *path.parents) if there.exists()))
+    except OSError as error:
+        raise _unwritable(path, error) from None
     if not path.exists():
-        _check_writable(next(above for above in path.parents if above.exists()), path)
         return False
     lock = _locked(path)
     try:
@@ -158,12 +161,9 @@ def _unwritable(path: Path, error: OSError) -> RunError:
     return RunError(f"{path} cannot be written to ({error.strerror}): choose another --out")
 
 
-def _check_writable(above: Path, path: Path) -> None:
-    """Refuse a folder to be made below one where nothing can be written."""
-    try:
-        tempfile.TemporaryFile(dir=above).close()
-    except OSError as error:
-        raise _unwritable(path, error) from None
+def check_writable(folder: Path) -> None:
+    """Raise an OSError unless files can be written in a folder; leaves none there."""
+    tempfile.TemporaryFile(dir=folder).close()
 
 
 def _locked(path: Path) -> int:

@@ -90,8 +90,17 @@ def check_seeds(seed: Any, num_envs: int) -> list[int | None]:
     return seeds
 
 
-def check_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
-    """Return the option "reset_mask", bool [num_envs], or raise a ValueError."""
+def check_asked(tasks: Any, task_set: TaskSet, num_envs: int) -> NDArray[np.int64]:
+    """Return the option "task", one for all or one for each, or raise a ValueError."""
+    wanted = tasks if isinstance(tasks, Sequence | np.ndarray) else [tasks] * num_envs
+    rows = check_rows(wanted, task_set)
+    if len(rows) != num_envs:
+        raise ValueError(f"option 'task' needs {num_envs} tasks, got {len(rows)}")
+    return rows
+
+
+def check_mask(name: str, mask: Any, num_envs: int) -> NDArray[np.bool_]:
+    """Return a mask, bool [num_envs], or raise a ValueError that names it."""
     if (
         not isinstance(mask, np.ndarray)
         or mask.dtype != np.bool_
@@ -99,7 +108,7 @@ def check_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
         or not mask.any()
     ):
         raise ValueError(
-            f"reset_mask must be a bool array of shape ({num_envs},) with at least one True, "
+            f"{name} must be a bool array of shape ({num_envs},) with at least one True, "
             f"got {mask!r}"
         )
     return mask

@@ -15,12 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from meta_envs import checks
 from meta_envs.definition import Definition, Floats, Terms
-from meta_envs.registry import definition, resolve, task_set
+from meta_envs.registry import OwnTasks, chosen_tasks, definition, resolve
 from meta_envs.streams import Streams
 from meta_envs.tasks import TaskSet
-
-OwnTasks = Mapping[str, float] | Sequence[Mapping[str, float]]
-"""Parameters of a task by their names, or of several tasks."""
 
 
 def _processors() -> int:
@@ -28,14 +25,6 @@ def _processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _tasks_of(name: str, tasks: TaskSet | None, own: OwnTasks | None) -> TaskSet:
-    if own is not None:
-        if tasks is not None:
-            raise ValueError("give task_set or task_params, not both")
-        return task_set(name).with_params(own)
-    return task_set(name) if tasks is None else checks.check_task_set(name, tasks)
 
 
 class MetaEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -74,7 +63,7 @@ class MetaEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             ImportError: the environment needs MuJoCo, or a newer one.
         """
         self.definition = definition(name)
-        self.task_set = _tasks_of(self.definition.name, task_set, task_params)
+        self.task_set = chosen_tasks(self.definition.name, task_set, task_params)
         # Copies, because a space holds the generator its samples come from.
         self.observation_space = copy.deepcopy(self.definition.observation_space)
         self.action_space = copy.deepcopy(self.definition.action_space)
@@ -191,7 +180,7 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         """
         row = resolve(name)
         self.definition = definition(row.name)
-        self.task_set = _tasks_of(row.name, task_set, task_params)
+        self.task_set = chosen_tasks(row.name, task_set, task_params)
         if tasks is None and isinstance(task_params, Sequence):
             tasks = range(len(task_params))
         count = checks.check_positive("num_envs", num_envs)
@@ -221,8 +210,8 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         self._streams = Streams([None] * self.num_envs)
         self._state: Floats | None = None
         self._every = np.ones(self.num_envs, dtype=np.bool_)
-        self._over = ~self._every
-        self._any_over = False
+        self._over = self._resting = ~self._every
+        self._any_over = self._any_resting = False
         self._clock = 0
         self._deadlines = np.zeros(self.num_envs, dtype=np.int64)
         self._first_deadline = 0
@@ -272,10 +261,12 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         checked = checks.check_options(options, ("task", "reset_mask"))
         mask = self._every
         if checked.get("reset_mask") is not None:
-            mask = checks.check_mask(checked["reset_mask"], self.num_envs)
+            mask = checks.check_mask("reset_mask", checked["reset_mask"], self.num_envs)
         if self._state is None and not mask.all():
             raise gymnasium.error.ResetNeeded("the first reset must reset every sub-environment")
-        tasks = self._asked_tasks(checked["task"]) if "task" in checked else self._tasks
+        tasks = self._tasks
+        if "task" in checked:
+            tasks = checks.check_asked(checked["task"], self.task_set, self.num_envs)
         seeds = None if seed is None else checks.check_seeds(seed, self.num_envs)
         self._tasks = np.where(mask, tasks, self._tasks)
         self._set_params()
@@ -285,15 +276,22 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
         self._state = self._restart(mask, self._state)
         self._over = self._over & ~mask
         self._any_over = bool(self._over.any())
+        self._resting = self._resting & ~mask
+        self._any_resting = bool(self._resting.any())
         self._start_paths(mask)
         return self.definition.observe(self._state), self._info({}, self._every)
 
-    def _asked_tasks(self, tasks: Any) -> NDArray[np.int64]:
-        wanted = tasks if isinstance(tasks, Sequence | np.ndarray) else [tasks] * self.num_envs
-        rows = checks.check_rows(wanted, self.task_set)
-        if len(rows) != self.num_envs:
-            raise ValueError(f"option 'task' needs {self.num_envs} tasks, got {len(rows)}")
-        return rows
+    def rest(self, mask: NDArray[np.bool_]) -> None:
+        """Let masked sub-environments [num_envs] stand still until they are reset.
+
+        A step does not simulate them, and gives them a reward of 0, no end and the observation that
+        they have; the masks of the reward's terms are False for them.
+        """
+        self._started()
+        self._resting = self._resting | checks.check_mask("mask", mask, self.num_envs)
+        self._any_resting = True
+        self._over = self._over & ~self._resting
+        self._any_over = bool(self._over.any())
 
     def step(
         self, actions: ArrayLike
@@ -310,25 +308,27 @@ class MetaVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[
                 f"sub-environments {np.flatnonzero(self._over).tolist()} are over: call "
                 "reset(options={'reset_mask': mask}) first, or choose another autoreset_mode"
             )
-        going = ~self._over if self._any_over else None
-        next_state = self._simulation.step(state, checked, going)
+        going = self._every
+        if self._any_over or self._any_resting:
+            going = ~(self._over | self._resting)
+        next_state = self._simulation.step(state, checked, None if going is self._every else going)
+        if self._any_resting:
+            next_state = np.where(self._resting[:, None], state, next_state)
         reward, terms = self.definition.reward(state, checked, next_state, self._params)
         terminated = self.definition.terminated(next_state)
         self._state = next_state
         self._clock += 1
-        stepped = self._every
         if self._any_over:
-            restarted = self._over
-            stepped = ~restarted
-            self._state = self._restart(restarted, next_state)
-            for values in (reward, terminated, *terms.values()):
-                values[restarted] = 0
-            self._start_paths(restarted)
+            self._state = self._restart(self._over, next_state)
+            self._start_paths(self._over)
         truncated = self._truncated()
-        self._extend_paths(stepped)
+        if going is not self._every:
+            for values in (reward, terminated, truncated, *terms.values()):
+                values[~going] = 0
+        self._extend_paths(going)
         self._over = terminated | truncated
         self._any_over = bool(np.count_nonzero(self._over))
-        info = self._info(terms, stepped)
+        info = self._info(terms, going)
         if self._any_over and self.autoreset_mode is AutoresetMode.SAME_STEP:
             self._reset_finished(info)
         return self.definition.observe(self._state), reward, terminated, truncated, info

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import difflib
 import importlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
 import gymnasium
 
+from meta_envs import checks
+
 if TYPE_CHECKING:
     from meta_envs.definition import Definition
     from meta_envs.tasks import TaskSet
+
+OwnTasks = Mapping[str, float] | Sequence[Mapping[str, float]]
+"""Parameters of a task by their names, or of several tasks."""
 
 
 @dataclass(frozen=True)
@@ -222,3 +228,16 @@ def _task_set(name: str) -> TaskSet:
 def task_set(name: str) -> TaskSet:
     """The tasks of an environment, by any of its names."""
     return _task_set(resolve(name).name)
+
+
+def chosen_tasks(name: str, tasks: TaskSet | None, own: OwnTasks | None) -> TaskSet:
+    """The tasks that an environment is made with: a set that is given, one's own, or its own.
+
+    Raises:
+        ValueError: a set of another environment, wrong parameters, or both.
+    """
+    if own is not None:
+        if tasks is not None:
+            raise ValueError("give task_set or task_params, not both")
+        return task_set(name).with_params(own)
+    return task_set(name) if tasks is None else checks.check_task_set(name, tasks)

@@ -14,7 +14,7 @@ from ctmrl.actor_critic import ActorCritic
 from ctmrl.data import OfflineData
 from ctmrl.errors import Diverged
 from ctmrl.meta_train import Learner, meta_train
-from ctmrl.runs import load_checkpoint
+from ctmrl.runs import load_checkpoint, read_json
 from tests.ctmrl.commands import Commands, contents, rows
 from tests.ctmrl.examples import smoke
 
@@ -172,6 +172,10 @@ def test_the_command_keeps_the_last_sound_checkpoint_and_stops_alike(
     assert commands.run("ctmrl.evaluate", str(path)) == 2
     assert commands.run("ctmrl.evaluate", str(path), "--unfinished") == 0
     assert commands.output().startswith("The checkpoint of step 6 of 60.\n")
+    several = ("--unfinished", "--protocols", "online", "np_online", "--out", "scored")
+    assert commands.run("ctmrl.evaluate", str(path), *several) == 0
+    for name in ("online", "np_online"):
+        assert read_json(commands.folder / "scored" / name / "evaluation.json")["step"] == 6
 
 
 def test_without_a_checkpoint(commands: Commands, wind_path: Path, tmp_path: Path) -> None:

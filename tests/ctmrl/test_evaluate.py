@@ -123,6 +123,13 @@ def test_fresh_tasks(
     assert (tmp_path / "out" / "adaptation.png").exists()
 
 
+def test_fresh_tasks_by_several_protocols(finished_run: FinishedRun, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    evaluate(finished_run.path, fresh=2, protocols=("online", "np_online"), out=out)
+    for name in ("online", "np_online"):
+        assert list(read_json(out / name / "evaluation.json")["groups"]) == ["fresh"]
+
+
 def test_another_seed_explores_otherwise(finished_run: FinishedRun, agent: Agent) -> None:
     config = config_from_settings(read_json(finished_run.path / "config.json"), Path())
     tasks = task_set("point_robot_wind").sample(seed=0, n_tasks=2)
@@ -294,5 +301,10 @@ def test_the_runs_own_folder_as_output(copy: Path, capsys: pytest.CaptureFixture
     shutil.copytree(copy, other)
     said = f"--out {other} is another run: choose another folder"
     assert mistake(capsys, copy, out=other, fresh=1) == said
-    assert contents(other) == before
+    below = copy.with_name("scored") / "online"
+    shutil.copytree(copy, below)
+    said = f"--out {below} is another run: choose another folder"
+    found = mistake(capsys, copy, out=below.parent, fresh=1, protocols=("np_online", "online"))
+    assert found == said
+    assert contents(below) == contents(other) == before
     assert contents(copy) == before

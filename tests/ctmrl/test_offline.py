@@ -132,9 +132,27 @@ def test_all_protocols_in_one_pass(
     assert contents(together / "np_online")["evaluation.json"] == trained
     explored = json.loads((together / "online" / "evaluation.json").read_text())["protocol"]
     assert (explored["random_episodes"], explored["policy_episodes"]) == (0, 4)
+    pictures = ["adaptation.png", "contexts.png", "evaluation.json"]
+    assert sorted(contents(together / "online")) == pictures
     # A report keeps them apart.
     assert commands.run("ctmrl.report", str(together)) == 0, commands.output()
     assert "ctmrl, offline" in commands.output()
+
+
+@pytest.mark.parametrize("method", ["oracle_task", "no_context", "focal"])
+def test_online_of_every_kind_of_encoder(
+    method: str, wind_path: Path, commands: Commands, tmp_path: Path
+) -> None:
+    run, scored = tmp_path / "run", tmp_path / "scored"
+    train = ("ctmrl.train", "--method", method, "--preset", "smoke", "--steps", "20", "--validate")
+    assert commands.run(*train, "--data", str(wind_path), "--out", str(run)) == 0
+    words = ("ctmrl.evaluate", str(run), "--protocols", "online", "--out", str(scored))
+    assert commands.run(*words) == 0, commands.output()
+    record = json.loads((scored / "evaluation.json").read_text())
+    for group in record["groups"].values():
+        # Whoever learns nothing from exploration acts alike before and after it.
+        alike = group["curve"][0] == group["curve"][-1]
+        assert alike == (method != "focal")
 
 
 def test_tasks_without_data_are_named(config: RunConfig, good_path: Path) -> None:

@@ -137,10 +137,11 @@ def test_the_multiplier_winds_up_in_the_released_reading_and_where_the_field_is_
     assert config.actor_critic.divergence_wind_up is wanted
 
 
-def test_the_dual_critic_has_the_fields_steps_wherever_there_is_one(config: RunConfig) -> None:
+def test_the_dual_critic_has_the_fields_steps_where_the_field_is_meant(config: RunConfig) -> None:
     robots_of_the_field = config.preset == "paper" and config.env not in POINT_ROBOTS
     assert config.actor_critic.behavior_regularization is robots_of_the_field
-    assert config.actor_critic.dual_steps == (3 if robots_of_the_field else 1)
+    wanted = config.method == "ctmrl_released" or robots_of_the_field
+    assert config.actor_critic.dual_steps == (3 if wanted else 1)
 
 
 def test_a_run_from_before_the_dual_critics_steps_were_an_option_has_one() -> None:

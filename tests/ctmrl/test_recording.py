@@ -179,7 +179,7 @@ def given(learner: Learner) -> Given:
     tasks = learner._draw_tasks(learner.generator)
     return Given(
         learner._draw(tasks, learner.method.context_sets),
-        learner.data.transitions(tasks, learner._rows, learner.generator),
+        learner.data.transitions(tasks, learner._rows_a_task, learner.generator),
         learner.data.params[tasks],
     )
 

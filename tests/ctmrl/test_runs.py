@@ -203,7 +203,7 @@ def test_what_is_refused_is_refused_before_the_settings_are_complete(
 
 def test_what_a_kill_left_before_the_first_file_is_no_obstacle(path: Path) -> None:
     path.mkdir(parents=True)
-    (path / ".config.json.1.partial").write_bytes(b"{")
+    (path / ".config.json.1.partial").write_bytes(b'{"sett')
     with opened(path):
         assert os.listdir(path) == ["config.json"]
 

@@ -109,6 +109,73 @@ def test_tasks_and_how_to_change_them() -> None:
     np.testing.assert_allclose(obs, vector.params, rtol=1e-6)
 
 
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize("name", ["sparse_point_robot", "noisy_robot", "hopper_params", "ant_goal"])
+def test_what_rests_stands_still_and_changes_nothing_for_the_others(
+    name: str, mode: AutoresetMode, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "noisy_robot":
+        request.getfixturevalue("noisy_robot")
+    steps = 12
+    env, other = (
+        MetaVectorEnv(name, tasks=[3, 0, 2], autoreset_mode=mode, max_episode_steps=2 * steps)
+        for _ in range(2)
+    )
+    shape = env.action_space.shape or ()
+    for one in (env, other):
+        one.reset(seed=4)
+    draw = np.random.default_rng(0)
+    mask = np.array([False, True, False])
+    simulated: list[list[bool]] = []
+    step = env._simulation.step
+
+    def spied(*given: Any) -> Any:
+        simulated.append([True] * 3 if given[2] is None else given[2].tolist())
+        return step(*given)
+
+    monkeypatch.setattr(env._simulation, "step", spied)
+    still = env.step(np.zeros(shape))[0][1]
+    other.step(np.zeros(shape))
+    env.rest(mask)
+    for _ in range(steps):
+        if mode is AutoresetMode.DISABLED:
+            for one in (env, other):
+                if one._over.any():
+                    one.reset(options={"reset_mask": one._over.copy()})
+        action = draw.uniform(-1, 1, shape)
+        found, wanted = env.step(action), other.step(action)
+        for index in range(4):
+            own, others = np.asarray(found[index]), np.asarray(wanted[index])
+            assert own[~mask].tobytes() == others[~mask].tobytes()
+        obs, reward, terminated, truncated, info = found
+        assert obs[1].tobytes() == still.tobytes()
+        assert (reward[1], terminated[1], truncated[1]) == (0, False, False)
+        assert not any(info[key][1] for key in info if key.startswith("_") and key != "_task")
+    assert not any(rows[1] for rows in simulated[1:])
+    # Reset, it goes on with its random stream where that was.
+    env.reset(options={"reset_mask": mask})
+    assert simulated[0] == [True] * 3
+    moved = env.step(np.ones(shape))
+    assert simulated[-1][1]
+    assert moved[0][1].tobytes() != still.tobytes()
+
+
+def test_what_is_over_and_rests_is_not_started_anew() -> None:
+    env = MetaVectorEnv("point_robot", tasks=[3, 0], max_episode_steps=1)
+    env.reset(seed=0)
+    last = env.step(np.ones((2, 2)))[0]
+    env.rest(np.array([True, False]))
+    obs, _, _, truncated, _ = env.step(np.ones((2, 2)))
+    assert obs[0].tolist() == last[0].tolist()
+    assert obs[1].tolist() == [0, 0]
+    assert env.step(np.ones((2, 2)))[3].tolist() == [False, True]
+    assert not truncated.any()
+    with pytest.raises(ValueError, match="mask must be a bool array"):
+        env.rest(np.array([1, 0]))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        MetaVectorEnv("point_robot").rest(np.array([True]))
+
+
 def test_another_task_set() -> None:
     fresh = task_set("point_robot").sample(seed=0, n_tasks=3)
     env = MetaEnv("point_robot", task=2, task_set=fresh)
