@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -306,4 +307,5 @@ def main(config: EvaluateConfig) -> None:
 if __name__ == "__main__":
     from ctmrl.console import run_command
 
-    sys.exit(run_command(lambda: main(tyro.cli(EvaluateConfig)), stopped="Stopped."))
+    parse = partial(tyro.cli, EvaluateConfig, prog="python -m ctmrl.evaluate")
+    sys.exit(run_command(lambda: main(parse()), stopped="Stopped."))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -292,4 +293,5 @@ def _write_csv(path: Path, text: str) -> None:
 if __name__ == "__main__":
     from ctmrl.console import run_command
 
-    sys.exit(run_command(lambda: main(tyro.cli(ReportConfig)), stopped="Stopped."))
+    parse = partial(tyro.cli, ReportConfig, prog="python -m ctmrl.report")
+    sys.exit(run_command(lambda: main(parse()), stopped="Stopped."))

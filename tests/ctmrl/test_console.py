@@ -16,6 +16,7 @@ from rich.console import Console
 from ctmrl.console import TrainingDisplay, run_command
 from ctmrl.errors import Diverged, UsageError
 from datagen.dataset import DatasetError
+from tests.ctmrl.commands import Commands
 
 ROW: dict[str, float | None] = {
     "step": 30,
@@ -167,3 +168,9 @@ def test_only_training_says_that_it_goes_on(
     with pytest.raises(SystemExit) as end:
         runpy.run_module(f"ctmrl.{module}", run_name="__main__")
     assert (end.value.code, capsys.readouterr().err) == (130, said)
+
+
+@pytest.mark.parametrize("module", ["train", "evaluate", "report", "profile"])
+def test_help_has_the_command_as_it_is_typed(module: str, commands: Commands) -> None:
+    assert commands.run(f"ctmrl.{module}", "--help") == 0
+    assert f"usage: python -m ctmrl.{module} " in commands.output()
