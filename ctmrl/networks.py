@@ -21,10 +21,10 @@ LARGEST_ACTION = 0.9999
 """Of the data's, where their density is asked for: before the tanh, 1 is infinitely far out."""
 
 BLOCK = 1024
-"""Rows a critic evaluates at once on a processor, and differentiates at once: what they need stays
-in the second cache, which makes 4096 rows a tenth faster to a fifth."""
+"""Rows a critic evaluates at once on a processor in float32, and differentiates at once: what they
+need stays in the second cache."""
 MLP_BLOCK = 4096
-"""The same of the other networks: it makes contexts of 16 x 1024 transitions a fifth faster."""
+"""The same of the other networks, and of critics in bfloat16: docs/speed.md has what both gain."""
 
 Layers = list[tuple[Tensor, Tensor]]
 """Weight and bias of each layer: of a critic [heads, in, out] and [heads, 1, out], else as
@@ -282,8 +282,10 @@ class Critic(nn.Module):
         """
         layers = layers or self.layers()
         x = torch.cat([self.standardize(obs), *others], dim=-1)
-        size = BLOCK if x.device.type == "cpu" else len(x)
-        blocks = [_values(rows, layers) for rows in torch.split(lowered(x), size)]
+        rows = lowered(x)
+        size = MLP_BLOCK if rows.dtype is torch.bfloat16 else BLOCK
+        size = size if x.device.type == "cpu" else len(x)
+        blocks = [_values(block, layers) for block in torch.split(rows, size)]
         return torch.cat(blocks, dim=1).to(x.dtype)
 
 
