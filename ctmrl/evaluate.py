@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ctmrl.protocols import Protocol
+from ctmrl.protocols import NP_ONLINE, Protocol
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,29 +52,14 @@ class EvaluateConfig:
     diverged."""
 
 
-def evaluate_agent(
+def evaluate_agent(  # noqa: PLR0913 - each decides what is measured
     agent: Agent,
     config: RunConfig,
     tasks: TaskSet,
     groups: dict[str, NDArray[np.int64]],
     best_behavior: dict[int, float],
     seed: int,
-) -> dict[str, Any]:
-    """Meta-test an agent by np_online; see `evaluate_protocols`."""
-    found = evaluate_protocols(
-        agent, config, tasks, groups, best_behavior, seed, {"np_online": None}
-    )
-    return found["np_online"]
-
-
-def evaluate_protocols(  # noqa: PLR0913 - each decides what is measured
-    agent: Agent,
-    config: RunConfig,
-    tasks: TaskSet,
-    groups: dict[str, NDArray[np.int64]],
-    best_behavior: dict[int, float],
-    seed: int,
-    protocols: Mapping[Protocol, dict[str, Tensor] | None],
+    protocols: Mapping[Protocol, dict[str, Tensor] | None] = NP_ONLINE,
 ) -> dict[Protocol, dict[str, Any]]:
     """Meta-test an agent by one or more protocols, all in one vector environment.
 
@@ -85,8 +70,8 @@ def evaluate_protocols(  # noqa: PLR0913 - each decides what is measured
         groups: rows of it by name, such as `unseen` and `seen`.
         best_behavior: return of each task's best behaviour policy, where known.
         seed: of the exploration, in each protocol anew.
-        protocols: by which; for `offline` with contexts of each group, as `offline_contexts` gives
-            them.
+        protocols: by which, np_online by default; for `offline` with contexts of each group, as
+            `offline_contexts` gives them.
 
     Returns:
         What evaluation.json holds, by protocol; returns are undiscounted sums, means where not said
@@ -187,7 +172,7 @@ def _folders(config: EvaluateConfig) -> dict[Protocol, Path]:
     return folders
 
 
-def _make(folders: Iterable[Path]) -> None:
+def _make_folders(folders: Iterable[Path]) -> None:
     """Make folders, and be sure that files can be written there.
 
     Raises:
@@ -290,8 +275,8 @@ def main(config: EvaluateConfig) -> None:
         one: offline_contexts(run_config, groups, seed, learned_from) if one == "offline" else None
         for one in config.protocols
     }
-    _make(folders.values())
-    records = evaluate_protocols(agent, run_config, tasks, groups, best, seed, protocols)
+    _make_folders(folders.values())
+    records = evaluate_agent(agent, run_config, tasks, groups, best, seed, protocols)
     console = Console()
     if step < dims.steps:
         console.print(f"The checkpoint of step {step} of {dims.steps}.")

@@ -283,8 +283,8 @@ class Critic(nn.Module):
         layers = layers or self.layers()
         x = torch.cat([self.standardize(obs), *others], dim=-1)
         rows = lowered(x)
-        size = MLP_BLOCK if rows.dtype is torch.bfloat16 else BLOCK
-        size = size if x.device.type == "cpu" else len(x)
+        most = MLP_BLOCK if rows.dtype is torch.bfloat16 else BLOCK
+        size = most if x.device.type == "cpu" else len(x)
         blocks = [_values(block, layers) for block in torch.split(rows, size)]
         return torch.cat(blocks, dim=1).to(x.dtype)
 

@@ -261,7 +261,8 @@ def _evaluate(
 
     groups = {"unseen": split.unseen, "seen": split.train}
     tasks = task_set(config.env)
-    record = evaluate_agent(learner.agent, config, tasks, groups, best, config.seed)
+    found = evaluate_agent(learner.agent, config, tasks, groups, best, config.seed)
+    record = found["np_online"]
     write_pictures(record, folder.path)
     folder.write_json(runs.EVALUATION, record)
     return record

@@ -134,7 +134,9 @@ def test_another_seed_explores_otherwise(finished_run: FinishedRun, agent: Agent
     config = config_from_settings(read_json(finished_run.path / "config.json"), Path())
     tasks = task_set("point_robot_wind").sample(seed=0, n_tasks=2)
     groups = {"fresh": np.arange(2)}
-    records = [evaluate_agent(agent, config, tasks, groups, {}, seed) for seed in (0, 0, 1)]
+    records = [
+        evaluate_agent(agent, config, tasks, groups, {}, seed)["np_online"] for seed in (0, 0, 1)
+    ]
     assert records[0] == records[1]
     assert records[0]["groups"]["fresh"]["contexts"] != records[2]["groups"]["fresh"]["contexts"]
 
@@ -148,7 +150,9 @@ def test_behaviour_no_better_than_random_is_no_scale(
     config = config_from_settings(read_json(finished_run.path / "config.json"), Path())
     groups = {"unseen": np.array([2, 7]), "seen": np.array([0, 1])}
     best = {2: 19.0, 7: 21.0, 0: 20.0, 1: 30.0}
-    record = evaluate_agent(agent, config, task_set("point_robot_wind"), groups, best, 0)
+    record = evaluate_agent(agent, config, task_set("point_robot_wind"), groups, best, 0)[
+        "np_online"
+    ]
     assert record["groups"]["unseen"]["score"] is None
     assert record["groups"]["seen"]["score"] < 0
     assert json.loads(to_json(record)) == record
@@ -172,7 +176,7 @@ def test_a_group_alone_has_the_record_it_has_beside_others(
     tasks = task_set("point_robot_wind")
     for name, group in record["groups"].items():
         rows = {name: np.array(group["tasks"])}
-        alone = evaluate_agent(agent, config, tasks, rows, {}, 0)["groups"][name]
+        alone = evaluate_agent(agent, config, tasks, rows, {}, 0)["np_online"]["groups"][name]
         # The best behaviour is the dataset's, which is not given here.
         alone["references"]["best_behavior"] = group["references"].get("best_behavior")
         assert json.loads(json.dumps(alone)) == group | {"references": alone["references"]}
@@ -282,7 +286,7 @@ def test_an_output_folder_that_is_a_file(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # It is told before anything is computed.
-    monkeypatch.setattr("ctmrl.evaluate.evaluate_protocols", None)
+    monkeypatch.setattr("ctmrl.evaluate.evaluate_agent", None)
     (tmp_path / "out").write_text("")
     for out, why in (
         (tmp_path / "out", "File exists"),

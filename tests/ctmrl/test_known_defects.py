@@ -131,7 +131,7 @@ def test_r3_returns_stand_under_the_names_of_their_tasks(
     encoder, actor = learner.method.encoder, learner.actor_critic.actor
     groups = {"unseen": tasks.test_tasks, "seen": wind_data.tasks}
     config = dataclasses.replace(smoke(), meta_test=ONCE)
-    found = evaluate_agent(learner.agent, config, tasks, groups, {}, 0)["groups"]
+    found = evaluate_agent(learner.agent, config, tasks, groups, {}, 0)["np_online"]["groups"]
     for name, rows in groups.items():
         wanted = meta_test(encoder, actor, tasks, rows, ONCE, 0).returns.mean()
         assert found[name]["return"] == pytest.approx(wanted)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from ctmrl.networks import (
     mean_encoding,
     mlp,
 )
+from ctmrl.precision import products_in
 from tests.ctmrl.examples import ACT, BATCH, LENGTH, OBS, Z, contexts, generator, normal, statistics
 
 HIDDEN = (23, 19)
@@ -225,6 +227,26 @@ def test_a_critic_gives_the_same_in_blocks_of_rows(
         critic.zero_grad()
     assert found[0][0].shape == (2, 11)
     torch.testing.assert_close(found[0], found[1])
+
+
+@pytest.mark.parametrize(("precision", "wanted"), [("float32", [4, 4, 3]), ("bfloat16", [6, 5])])
+def test_a_critics_blocks_are_of_its_precision(
+    precision: Any, wanted: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    critic = Critic(statistics().obs, ACT, (8, 7), heads=2)
+    sizes: list[int] = []
+    values = networks._values
+
+    def spied(rows: Tensor, *rest: Any) -> Tensor:
+        sizes.append(len(rows))
+        return values(rows, *rest)
+
+    monkeypatch.setattr(networks, "_values", spied)
+    monkeypatch.setattr(networks, "BLOCK", 4)
+    monkeypatch.setattr(networks, "MLP_BLOCK", 6)
+    with products_in(precision):
+        critic(torch.randn(11, OBS), torch.randn(11, ACT))
+    assert sizes == wanted
 
 
 def test_a_critic_starts_like_torchs_layers() -> None:

@@ -184,7 +184,7 @@ def test_other_data_than_the_run_learned_from_are_refused(
         (("--protocols", "offline", "--data", "nowhere"), "nowhere"),
         (("--protocols", "online", "online"), "one or more, each once, got online online"),
         (("--protocols",), "one or more, each once, got none"),
-        (("--protocols", "of"), "of"),
+        (("--protocols", "of"), "invalid choice 'of' for argument '--protocols'"),
     ],
 )
 def test_options_that_do_not_fit(

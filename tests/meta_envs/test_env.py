@@ -153,11 +153,14 @@ def test_what_rests_stands_still_and_changes_nothing_for_the_others(
         assert not any(info[key][1] for key in info if key.startswith("_") and key != "_task")
     assert not any(rows[1] for rows in simulated[1:])
     # Reset, it goes on with its random stream where that was.
-    env.reset(options={"reset_mask": mask})
+    twin = MetaVectorEnv(name, tasks=[3, 0, 2])
+    twin.reset(seed=4)
+    begun, wanted_obs = (one.reset(options={"reset_mask": mask})[0] for one in (env, twin))
+    assert begun[1].tobytes() == wanted_obs[1].tobytes()
     assert simulated[0] == [True] * 3
     moved = env.step(np.ones(shape))
     assert simulated[-1][1]
-    assert moved[0][1].tobytes() != still.tobytes()
+    assert moved[0][1].tobytes() != begun[1].tobytes()
 
 
 def test_what_is_over_and_rests_is_not_started_anew() -> None:

@@ -89,7 +89,7 @@ def test_a_meta_test_tells_each_task_its_own_parameters_from_the_first_episode_o
     rows = np.arange(4) if fresh else np.array([7, 2])
     for _ in range(3):
         learner.update()
-    record = evaluate_agent(learner.agent, config, tasks, {"fresh": rows}, {}, seed=0)
+    record = evaluate_agent(learner.agent, config, tasks, {"fresh": rows}, {}, seed=0)["np_online"]
     group = record["groups"]["fresh"]
     wanted = standardised(tasks.params[rows], wind_data)
     np.testing.assert_allclose(group["contexts"], wanted, rtol=1e-4, atol=1e-5)
@@ -98,7 +98,7 @@ def test_a_meta_test_tells_each_task_its_own_parameters_from_the_first_episode_o
     assert record["note"] == "reference, given the true task"
     # Told of no wind it acts otherwise.
     monkeypatch.setattr(TrueTask, "told", lambda encoder, z, params: z)
-    blind = evaluate_agent(learner.agent, config, tasks, {"fresh": rows}, {}, seed=0)
+    blind = evaluate_agent(learner.agent, config, tasks, {"fresh": rows}, {}, seed=0)["np_online"]
     assert (np.array(blind["groups"]["fresh"]["curve"]) != group["curve"]).all()
 
 
