@@ -79,14 +79,15 @@ class Group:
         """
         threads = dict.fromkeys(THREAD_VARIABLES, "1")
         threads["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-        self.errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
+        # A file each: two that end at once would write into each other's words.
+        self.errors = [tempfile.TemporaryFile() for _ in range(processes)]  # noqa: SIM115
         self.members = [
             subprocess.Popen(
                 [python, str(SIDE), *arguments, "--first-task", str(tasks * number)],
                 env={**os.environ, **threads},
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=self.errors,
+                stderr=self.errors[number],
                 text=True,
             )
             for number in range(processes)
@@ -99,18 +100,18 @@ class Group:
 
     def _answers(self) -> float:
         total = 0.0
-        for member in self.members:
+        for number, member in enumerate(self.members):
             assert member.stdout is not None
             line = member.stdout.readline()
             if not line:
-                raise RuntimeError(f"{SIDE.name} ended: {self._last_words()}")
+                raise RuntimeError(f"{SIDE.name} ended: {self._last_words(number)}")
             total += float(line)
         return total
 
-    def _last_words(self) -> str:
-        """The last line of what the processes said went wrong."""
-        self.errors.seek(0)
-        lines = self.errors.read().decode(errors="replace").strip().splitlines()
+    def _last_words(self, number: int) -> str:
+        """The last line of what a process said went wrong."""
+        self.errors[number].seek(0)
+        lines = self.errors[number].read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it did not say why"
 
     def learn(self, seconds: float) -> float:
@@ -133,7 +134,8 @@ class Group:
             member.kill()
             with suppress(BrokenPipeError):
                 member.communicate()
-        self.errors.close()
+        for errors in self.errors:
+            errors.close()
 
 
 def measure(case: tuple[str, int, int, int], options: Benchmark) -> list[Result]:
