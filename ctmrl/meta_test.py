@@ -115,10 +115,15 @@ class _Adaptation:
         self.count += context.shape[1]
 
     @property
-    def z(self) -> Tensor:
-        """What the policy is given: contexts so far, [n, Z]; 0 before any transition."""
+    def told(self) -> Tensor:
+        """What the policy is told: contexts so far, [n, Z]; 0 before any transition."""
         mean = (self.total / self.count.clamp_min(1.0)).float()
         return self.encoder.told(mean, self.params)
+
+    @property
+    def z(self) -> Tensor:
+        """The same as the policy's network gets it."""
+        return self.encoder.scaled(self.told)
 
     def random(self, obs: Tensor) -> NDArray[np.float32]:
         """Uniform actions."""
@@ -183,7 +188,7 @@ class _Adaptation:
         return MetaTestResult(
             scored.reshape(shape),
             np.stack(curve).reshape(-1, *shape).mean(axis=1),
-            self.z.numpy().reshape(*shape, -1),
+            self.told.numpy().reshape(*shape, -1),
         )
 
 

@@ -199,7 +199,8 @@ class Learner:
             context_loss, metrics = self.method.context_loss(contexts, encodings, source)
             # Detached: the actor-critic must not train the encoder. It has the first set's.
             z = mean_encoding(encodings.detach())
-            told = self.method.encoder.told(z[0], params)
+            self.method.encoder.show(z)
+            told = self.method.encoder.scaled(self.method.encoder.told(z[0], params))
             repeated = told.repeat_interleave(self.config.batch_size, dim=0)
             batch, *further = split_batches(rows, len(told), self.actor_critic.config.batches)
             policy_loss, more = self.actor_critic.loss(batch, repeated, source, further)

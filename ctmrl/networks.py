@@ -26,6 +26,9 @@ need stays in the second cache."""
 MLP_BLOCK = 4096
 """The same of the other networks, and of critics in bfloat16: docs/speed.md has what both gain."""
 
+RUNNING_RATE = 0.01
+"""Least share of running statistics that a batch makes up."""
+
 Layers = list[tuple[Tensor, Tensor]]
 """Weight and bias of each layer: of a critic [heads, in, out] and [heads, 1, out], else as
 PyTorch's linear layer has them."""
@@ -84,6 +87,37 @@ class Standardize(nn.Module):
         return self.mean + standardized * std
 
 
+class RunningStandardize(nn.Module):
+    """(x - mean) / std with statistics that follow what it is shown in training.
+
+    The first hundred times they are means of all it was shown, then exponential ones.
+    """
+
+    shown: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, size: int) -> None:
+        """Begin with statistics [size] that change nothing, as buffers."""
+        super().__init__()
+        self.register_buffer("shown", torch.zeros(()))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("variance", torch.ones(size))
+
+    @torch.no_grad()
+    def show(self, x: Tensor) -> None:
+        """Let the statistics follow rows x, [n, size]."""
+        self.shown.add_(1.0)
+        rate = self.shown.reciprocal().clamp_min(RUNNING_RATE)
+        self.mean.lerp_(x.mean(dim=0), rate)
+        self.variance.lerp_((x - self.mean).square().mean(dim=0), rate)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Standardised x, [*, size]; constant columns pass as 0."""
+        scale = torch.where(self.variance > 1e-12, self.variance.clamp_min(1e-12).rsqrt(), 0.0)
+        return (x - self.mean) * scale
+
+
 class Statistics(NamedTuple):
     """Mean and standard deviation of the training tasks' data.
 
@@ -126,6 +160,13 @@ class Encoder(nn.Module, ABC):
         """
         return z
 
+    def show(self, contexts: Tensor) -> None:
+        """Let what `scaled` does follow a training batch's contexts, [*, Z]."""
+
+    def scaled(self, told: Tensor) -> Tensor:
+        """What the networks of the actor-critic get for what the policy is told, [*, Z]."""
+        return told
+
 
 def mean_encoding(encodings: Tensor) -> Tensor:
     """Task-specific contexts c^spe = mean_t e(h^t), [*, n, Z] -> [*, Z]."""
@@ -150,6 +191,7 @@ class ContextEncoder(Encoder):
         hidden: tuple[int, ...],
         z_dim: int,
         sees_dense_reward: bool = False,
+        standardize_contexts: bool = False,
     ) -> None:
         """Build the network; whether it sees s' follows from the statistics' size."""
         super().__init__(z_dim, sees_dense_reward)
@@ -157,6 +199,19 @@ class ContextEncoder(Encoder):
         self.standardize = Standardize(*statistics)
         self.in_dim = len(statistics[0])
         self.net = mlp(self.in_dim, hidden, z_dim)
+        self.running = RunningStandardize(z_dim) if standardize_contexts else None
+
+    def show(self, contexts: Tensor) -> None:
+        """Let the statistics follow contexts [*, Z], if there are any."""
+        if self.running is not None:
+            self.running.show(contexts.flatten(0, -2))
+
+    def scaled(self, told: Tensor) -> Tensor:
+        """Standardised contexts [*, Z], 0 where there is no transition yet; or the contexts."""
+        if self.running is None:
+            return told
+        nothing = (told == 0).all(dim=-1, keepdim=True)
+        return torch.where(nothing, 0.0, self.running(told))
 
     def forward(self, context: Tensor) -> Tensor:
         """Encodings e(h), [*, n, Z], of transitions (s, a, r, s'), [*, n, O + A + 1 + O]."""

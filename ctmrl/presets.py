@@ -135,8 +135,16 @@ LEGS = ROBOT | {
     "cloning_advantage": 0.0,
     "cloning_rank": 10.0,
 }
-# Half as wide, some tasks' gaits are not learned (docs/methods/actor_critic.md).
-WALKER = LEGS | {"hidden": (512, 512)}
+# Half as wide, some tasks' gaits are not learned (docs/methods/actor_critic.md). Contexts that form
+# late and differ little are not used by the policy (docs/methods/ctmrl.md).
+WALKER = LEGS | {
+    "hidden": (512, 512),
+    "context_size": 128,
+    "standardize_contexts": True,
+    "encoder_lr": 3e-3,
+    "contrast_weight": 1.0,
+    "warm_up": 0.03,
+}
 # With the value of the policy's own actions returns are those of standing still
 # (docs/methods/actor_critic.md).
 ANT = ROBOT | {
@@ -164,7 +172,13 @@ SMOKE: Settings = {
 }
 """What every environment's smoke preset has on top of its standard one."""
 
-OF_METHODS: dict[str, Settings] = {"ctmrl_released": {"divergence_wind_up": True, "dual_steps": 3}}
+OF_METHODS: dict[str, Settings] = {
+    "ctmrl_released": {
+        "divergence_wind_up": True,
+        "dual_steps": 3,
+        "standardize_contexts": False,
+    }
+}
 """What a method has in every preset of every environment on top of those."""
 
 ROWS: dict[str, Row] = {

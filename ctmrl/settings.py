@@ -9,6 +9,7 @@ LATER_SETTINGS: dict[str, Any] = {
     "data_episodes": None,
     "precision": "float32",
     "device": "cpu",
+    "context": {"standardize_contexts": False},
     "actor_critic": {
         "behavior_cloning": 0.0,
         "cloning_advantage": 0.0,

@@ -29,6 +29,10 @@ class MethodConfig:
     dense_reward_in_context: bool = False
     """On a sparse environment, let contexts see the dense reward, in training and in the meta-test,
     as some of the field's scripts do; scores stay sparse."""
+    standardize_contexts: bool = False
+    """Standardise contexts over the training tasks before actor and critics get them, by running
+    statistics. Tasks' contexts lie close together, and networks learn little from what hardly
+    differs beside observations, which have a spread of 1."""
 
 
 class Dimensions(NamedTuple):
@@ -75,6 +79,7 @@ class Method(nn.Module, ABC):
             config.encoder_hidden,
             config.z_dim,
             config.dense_reward_in_context,
+            config.standardize_contexts,
         )
 
     @abstractmethod

@@ -20,6 +20,7 @@ from ctmrl.networks import (
     ContextEncoder,
     Critic,
     Predictors,
+    RunningStandardize,
     Standardize,
     mean_encoding,
     mlp,
@@ -83,6 +84,46 @@ def test_the_inverse_of_standardising_gives_the_mean_in_constant_columns() -> No
     mean, std = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 0.0, 0.5])
     found = Standardize(mean, std).inverse(torch.tensor([[1.0, 9.0, 0.0], [0.0, -9.0, -2.0]]))
     assert found.tolist() == [[3.0, 2.0, 3.0], [1.0, 2.0, 2.0]]
+
+
+def test_running_statistics_are_means_at_first_and_exponential_ones_later() -> None:
+    running, shown = RunningStandardize(2), normal(150, 40, 2).float()
+    shown[..., 0] = 3.0
+    assert running(shown[0]).equal(shown[0])
+    for count, rows in enumerate(shown, start=1):
+        running.show(rows)
+        if count == 100:
+            torch.testing.assert_close(running.mean, shown[:count].flatten(0, 1).mean(dim=0))
+            spread = shown[:count].flatten(0, 1).std(dim=0)
+            torch.testing.assert_close(running.variance.sqrt(), spread, rtol=0.02, atol=1e-6)
+    mean = shown[:100].flatten(0, 1).mean(dim=0)
+    for rows in shown[100:]:
+        mean = 0.99 * mean + 0.01 * rows.mean(dim=0)
+    torch.testing.assert_close(running.mean, mean)
+    found = running(shown[0])
+    assert found[:, 0].equal(torch.zeros(40))
+    wanted = (shown[0, :, 1] - running.mean[1]) / running.variance[1].sqrt()
+    torch.testing.assert_close(found[:, 1], wanted)
+
+
+def test_contexts_are_standardised_for_the_policy_but_where_there_is_none_yet() -> None:
+    plain, encoder = (
+        ContextEncoder(statistics().context, OBS, HIDDEN, Z, standardize_contexts=on)
+        for on in (False, True)
+    )
+    z = 0.1 * normal(2, BATCH, Z).float() + 0.5
+    for one in (plain, encoder):
+        one.show(z)
+    assert plain.scaled(z) is z
+    assert not any("running" in key for key in plain.state_dict())
+    scaled = encoder.scaled(z)
+    torch.testing.assert_close(scaled.mean(dim=(0, 1)), torch.zeros(Z), atol=1e-5, rtol=0)
+    spread = scaled.flatten(0, 1).std(dim=0, correction=0)
+    torch.testing.assert_close(spread, torch.ones(Z))
+    z[1, 3] = 0.0
+    assert encoder.scaled(z)[1, 3].equal(torch.zeros(Z))
+    assert encoder.scaled(z)[0].equal(scaled[0])
+    assert len([*encoder.parameters()]) == len([*plain.parameters()])
 
 
 @pytest.mark.parametrize("next_obs", [True, False])

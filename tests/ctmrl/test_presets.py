@@ -157,6 +157,12 @@ def test_a_run_from_before_the_dual_critics_steps_were_an_option_has_one() -> No
     )
 
 
+def test_contexts_are_standardised_where_that_was_found_to_help(config: RunConfig) -> None:
+    walker = config.env.startswith("walker") and config.preset != "paper"
+    wanted = walker and config.method != "ctmrl_released"
+    assert config.context.standardize_contexts is wanted
+
+
 def test_every_environment_has_presets() -> None:
     assert list(ROWS) == list(ENVIRONMENTS)
 

@@ -39,17 +39,19 @@ def config(method: str, precision: str = "float32", decay: bool = False) -> RunC
     """With behaviour regularisation, and rates that float32 has exactly.
 
     `oracle_task` also clones and learns the value of the data's actions, as AntGoal's presets do.
-    `focal`, and what is in bfloat16, takes three steps of the dual critic.
+    `focal`, and what is in bfloat16, takes three steps of the dual critic, and its contexts are
+    standardised.
     """
     made = config_of(method, brac=True, precision=precision, steps=STEPS, decay=decay)
     rates: dict[str, Any] = {"learning_rate": 2.0**-10, "dual_lr": 2.0**-11}
     if method == "oracle_task":
         rates |= {"behavior_cloning": 5.0, "cloning_advantage": 3.0, "value_expectile": 0.8}
-    if method == "focal" or precision == "bfloat16":
+    more = method == "focal" or precision == "bfloat16"
+    if more:
         rates["dual_steps"] = 3
     return dataclasses.replace(
         made,
-        context=dataclasses.replace(made.context, encoder_lr=2.0**-9),
+        context=dataclasses.replace(made.context, encoder_lr=2.0**-9, standardize_contexts=more),
         actor_critic=dataclasses.replace(made.actor_critic, **rates),
     )
 
