@@ -177,6 +177,7 @@ OF_METHODS: dict[str, Settings] = {
         "divergence_wind_up": True,
         "dual_steps": 3,
         "standardize_contexts": False,
+        "warm_up": 0.3,
     }
 }
 """What a method has in every preset of every environment on top of those."""
