@@ -212,7 +212,8 @@ class Learner:
         self.actor_critic.follow_value()
         metrics |= _spread(z) | more
         data = {f"data/{name}": values for name, values in rows._asdict().items()}
-        made = {"data/context": contexts, **data, "contexts": z, **metrics, "loss": loss}
+        made = {"data/context": contexts, **data, "contexts": z, "contexts as told": told}
+        made |= {**metrics, "loss": loss}
         return metrics, made
 
     def _gradients_and_parameters(self) -> dict[str, Tensor]:

@@ -27,7 +27,9 @@ MLP_BLOCK = 4096
 """The same of the other networks, and of critics in bfloat16: docs/speed.md has what both gain."""
 
 RUNNING_RATE = 0.01
-"""Least share of running statistics that a batch makes up."""
+"""A batch's share in running statistics, from the hundredth on."""
+LARGEST_CONTEXT = 10.0
+"""Of standardised ones, where a task's is far from those of training."""
 
 Layers = list[tuple[Tensor, Tensor]]
 """Weight and bias of each layer: of a critic [heads, in, out] and [heads, 1, out], else as
@@ -88,9 +90,9 @@ class Standardize(nn.Module):
 
 
 class RunningStandardize(nn.Module):
-    """(x - mean) / std with statistics that follow what it is shown in training.
+    """(x - mean) / std, within bounds, with statistics that follow what it is shown in training.
 
-    The first hundred times they are means of all it was shown, then exponential ones.
+    They are means over all batches until a batch's share is RUNNING_RATE, then exponential ones. The variance is that within a batch, so what moves all rows leaves it alone.
     """
 
     shown: Tensor
@@ -106,16 +108,17 @@ class RunningStandardize(nn.Module):
 
     @torch.no_grad()
     def show(self, x: Tensor) -> None:
-        """Let the statistics follow rows x, [n, size]."""
+        """Let the statistics follow a batch x, [n, size]."""
         self.shown.add_(1.0)
         rate = self.shown.reciprocal().clamp_min(RUNNING_RATE)
-        self.mean.lerp_(x.mean(dim=0), rate)
-        self.variance.lerp_((x - self.mean).square().mean(dim=0), rate)
+        mean = x.mean(dim=0)
+        self.mean.lerp_(mean, rate)
+        self.variance.lerp_((x - mean).square().mean(dim=0), rate)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Standardised x, [*, size]; constant columns pass as 0."""
+        """Standardised x, [*, size], within LARGEST_CONTEXT; constant columns pass as 0."""
         scale = torch.where(self.variance > 1e-12, self.variance.clamp_min(1e-12).rsqrt(), 0.0)
-        return (x - self.mean) * scale
+        return ((x - self.mean) * scale).clamp(-LARGEST_CONTEXT, LARGEST_CONTEXT)
 
 
 class Statistics(NamedTuple):

@@ -97,13 +97,24 @@ def test_running_statistics_are_means_at_first_and_exponential_ones_later() -> N
             spread = shown[:count].flatten(0, 1).std(dim=0)
             torch.testing.assert_close(running.variance.sqrt(), spread, rtol=0.02, atol=1e-6)
     mean = shown[:100].flatten(0, 1).mean(dim=0)
+    variance = shown[:100].var(dim=1, correction=0).mean(dim=0)
     for rows in shown[100:]:
         mean = 0.99 * mean + 0.01 * rows.mean(dim=0)
+        variance = 0.99 * variance + 0.01 * rows.var(dim=0, correction=0)
     torch.testing.assert_close(running.mean, mean)
+    torch.testing.assert_close(running.variance, variance)
     found = running(shown[0])
     assert found[:, 0].equal(torch.zeros(40))
+    assert running(torch.tensor([[3.0, 1e6], [3.0, -1e6]])).tolist() == [[0, 10], [0, -10]]
     wanted = (shown[0, :, 1] - running.mean[1]) / running.variance[1].sqrt()
     torch.testing.assert_close(found[:, 1], wanted)
+
+
+def test_what_moves_all_contexts_leaves_the_running_spread_alone() -> None:
+    running, rows = RunningStandardize(1), 0.02 * normal(500, 1).float()
+    for step in range(300):
+        running.show(rows + 0.01 * step)
+    torch.testing.assert_close(running.variance.sqrt(), rows.std(dim=0), rtol=0.01, atol=0)
 
 
 def test_contexts_are_standardised_for_the_policy_but_where_there_is_none_yet() -> None:
