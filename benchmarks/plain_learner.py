@@ -4,8 +4,8 @@ Networks, batches and losses are those of `ctmrl`; the means are plain: a Linear
 each critic a network of its own, contexts repeated for every transition, numpy columns sampled task
 by task and copied, a backward pass and an Adam for each network. As in the field's code, the
 actor's loss also differentiates the critics' weights, which nobody needs. It knows the settings of
-the source paper alone: `dual_penalty` is "value", `metric_weight` is 0, and there is neither
-cloning nor an expectile.
+the source paper alone: `dual_penalty` is "value", `metric_weight` is 0, and there are
+neither cloning nor an expectile nor standardised contexts.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class MetaTestResult(NamedTuple):
         returns: final return of each repetition and task, [R, n].
         curve: return of one deterministic episode after 0..E exploration episodes, mean over
             repetitions, [E + 1, n]; of `online` the exploration episodes are those.
-        contexts: final context of each repetition and task, [R, n, Z].
+        contexts: final context of each repetition and task, not standardised, [R, n, Z].
     """
 
     returns: Floats

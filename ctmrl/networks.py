@@ -92,7 +92,8 @@ class Standardize(nn.Module):
 class RunningStandardize(nn.Module):
     """(x - mean) / std, within bounds, with statistics that follow what it is shown in training.
 
-    They are means over all batches until a batch's share is RUNNING_RATE, then exponential ones. The variance is that within a batch, so what moves all rows leaves it alone.
+    They are means over all batches until a batch's share is RUNNING_RATE, then exponential ones.
+    The variance is that within a batch, so what moves all rows leaves it alone.
     """
 
     shown: Tensor

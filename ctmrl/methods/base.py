@@ -30,9 +30,9 @@ class MethodConfig:
     """On a sparse environment, let contexts see the dense reward, in training and in the meta-test,
     as some of the field's scripts do; scores stay sparse."""
     standardize_contexts: bool = False
-    """Standardise contexts over the training tasks before actor and critics get them, by running
-    statistics. Tasks' contexts lie close together, and networks learn little from what hardly
-    differs beside observations, which have a spread of 1."""
+    """Standardise contexts before actor and critics get them, by running statistics over training
+    tasks. Tasks' contexts lie close together, and networks learn little from what hardly differs
+    beside observations, which have a spread of 1."""
 
 
 class Dimensions(NamedTuple):

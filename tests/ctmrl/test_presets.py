@@ -157,10 +157,31 @@ def test_a_run_from_before_the_dual_critics_steps_were_an_option_has_one() -> No
     )
 
 
-def test_contexts_are_standardised_where_that_was_found_to_help(config: RunConfig) -> None:
+def test_the_walkers_contexts_form_early_and_differ(config: RunConfig) -> None:
     walker = config.env.startswith("walker") and config.preset != "paper"
-    wanted = walker and config.method != "ctmrl_released"
-    assert config.context.standardize_contexts is wanted
+    released = config.method == "ctmrl_released"
+    assert config.context.standardize_contexts is (walker and not released)
+    if walker:
+        assert config.context.encoder_lr == 3e-3
+    if walker and isinstance(config.context, CTMRLConfig):
+        assert (config.context.contrast_weight, config.context.warm_up) == (1.0, 0.03)
+    if walker and config.preset == "standard":
+        assert config.training.context_size == 128
+    if isinstance(config.context, CTMRLReleasedConfig):
+        assert config.context.warm_up == 0.3
+
+
+def test_a_run_from_before_contexts_could_be_standardised_has_them_as_they_are() -> None:
+    config = preset("walker_params", "ctmrl", "standard", precision="float32")
+    stored = through_a_file(config)
+    del stored["settings"]["context"]["standardize_contexts"]
+    found = config_from_settings(stored, PATH)
+    plain = dataclasses.replace(config.context, standardize_contexts=False)
+    assert found == dataclasses.replace(config, context=plain)
+    # And its file, written anew, stays what it is.
+    assert without_later_settings(through_a_file(found)["settings"]) == without_later_settings(
+        stored["settings"]
+    )
 
 
 def test_every_environment_has_presets() -> None:
