@@ -115,7 +115,7 @@ def test_a_stored_agent_has_the_statistics(wind_data: OfflineData) -> None:
     train(learner, STEPS)
     dims = Dimensions(2, 2, len(wind_data), STEPS)
     agent = load_agent(config, dims, learner.state())
-    z = torch.rand(3, config.context.z_dim)
+    z = torch.linspace(-0.9, 0.8, 3 * config.context.z_dim).view(3, -1)
     found, wanted = (one.method.encoder.scaled(z) for one in (agent, learner.agent))
     assert found.equal(wanted)
     assert not found.equal(z)
@@ -135,16 +135,20 @@ class Scaling(Actor):
 
 
 def test_a_meta_test_standardises_for_the_policy_and_shows_contexts_as_they_are() -> None:
-    ones, mean, std = torch.ones(7), torch.rand(5) - 0.5, 0.1 + torch.rand(5)
-    plain, encoder = (
-        ContextEncoder((0.1 * ones, 0.5 * ones), 2, (11,), 5, standardize_contexts=on)
-        for on in (False, True)
-    )
+    ones = torch.ones(7)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        # So that none is as large as the bound.
+        mean, std = torch.rand(5) - 0.5, 0.2 + torch.rand(5)
+        plain, encoder = (
+            ContextEncoder((0.1 * ones, 0.5 * ones), 2, (11,), 5, standardize_contexts=on)
+            for on in (False, True)
+        )
+        own, simple = Scaling(mean, std), Actor((torch.zeros(2), torch.ones(2)), 5, (13,), 2)
     assert encoder.running is not None
     encoder.running.mean.copy_(mean)
     encoder.running.variance.copy_(std.square())
     encoder.net.load_state_dict(plain.net.state_dict())
-    own, simple = Scaling(mean, std), Actor((torch.zeros(2), torch.ones(2)), 5, (13,), 2)
     simple.load_state_dict(own.state_dict())
     config = MetaTestConfig(random_episodes=2, policy_episodes=2, repetitions=2)
     tasks, rows = task_set("point_robot_wind"), np.array([4, 0, 7])
