@@ -35,7 +35,9 @@ class EvaluateConfig:
     protocols: tuple[Protocol, ...] = ("np_online",)
     """Which meta-tests, one or more, all in one pass. np_online, training's own: random episodes,
     then the stochastic policy's. online: as many episodes of the deterministic policy. offline: no
-    exploration, contexts are of the tasks' own data, so the dataset must have the test tasks."""
+    exploration, contexts are of the tasks' own data, so the dataset must have the test tasks.
+    codes: the first episodes act on the codes instead of at random, and what returns most counts,
+    for rewards that random actions never see; of methods with a codebook."""
     data: Path | None = None
     """Dataset folder for offline contexts, of the data that the run learned from; default
     datasets/<environment>."""
@@ -91,7 +93,12 @@ def evaluate_agent(  # noqa: PLR0913 - each decides what is measured
             anchors[name]["best_behavior"] = sum(best) / len(best)
     test = MetaTest(agent.method.encoder, agent.actor, tasks, config.meta_test, seed, threads)
     asked = {
-        f"{protocol}/{name}": Group(rows, protocol, None if data is None else data[name])
+        f"{protocol}/{name}": Group(
+            rows,
+            protocol,
+            None if data is None else data[name],
+            agent.method.codes if protocol == "codes" else None,
+        )
         for protocol, data in protocols.items()
         for name, rows in groups.items()
     }
@@ -124,7 +131,9 @@ def _described(protocol: Protocol, config: RunConfig) -> dict[str, Any]:
     import dataclasses
 
     found = dataclasses.asdict(config.meta_test)
-    if protocol != "np_online":
+    if protocol == "codes":
+        found |= {"random_episodes": 0, "code_episodes": config.meta_test.random_episodes}
+    elif protocol != "np_online":
         explored = config.meta_test.random_episodes + config.meta_test.policy_episodes
         policy = explored if protocol == "online" else 0
         found |= {"random_episodes": 0, "policy_episodes": policy}
@@ -239,6 +248,7 @@ def main(config: EvaluateConfig) -> None:
     from ctmrl import runs
     from ctmrl.agent import load_agent
     from ctmrl.config import check_settings
+    from ctmrl.errors import UsageError
     from ctmrl.methods.base import Dimensions
     from ctmrl.offline import offline_contexts
     from ctmrl.presets import config_from_settings
@@ -267,6 +277,10 @@ def main(config: EvaluateConfig) -> None:
         raise runs.RunError(
             f"{config.run} stopped at step {step} of {dims.steps}: "
             "give its training command again to finish it, or --unfinished to score it as it is"
+        )
+    if "codes" in config.protocols and agent.method.codes is None:
+        raise UsageError(
+            f"--protocols codes is for methods with a codebook, and {run_config.method} has none"
         )
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)

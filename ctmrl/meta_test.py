@@ -40,11 +40,13 @@ class Group(NamedTuple):
         protocol: how contexts come about.
         data: for `offline`, the tasks' transitions [R * n, T, O + A + 1 + O], repetition by
             repetition.
+        codes: for `codes`, contexts to act on before there are others, [N, Z].
     """
 
     rows: NDArray[np.int64]
     protocol: Protocol = "np_online"
     data: Tensor | None = None
+    codes: Tensor | None = None
 
 
 class MetaTestResult(NamedTuple):
@@ -54,7 +56,8 @@ class MetaTestResult(NamedTuple):
         returns: final return of each repetition and task, [R, n].
         curve: return of one deterministic episode after 0..E exploration episodes, mean over
             repetitions, [E + 1, n]; of `online` the exploration episodes are those.
-        contexts: final context of each repetition and task, not standardised, [R, n, Z].
+        contexts: what the policy is told at last, of each repetition and task, not standardised,
+            [R, n, Z].
     """
 
     returns: Floats
@@ -108,6 +111,7 @@ class _Adaptation:
         self.generator = torch.Generator().manual_seed(test.seed)
         self.total = torch.zeros(self.size, self.encoder.z_dim, dtype=torch.float64)
         self.count = torch.zeros(self.size, 1, dtype=torch.float64)
+        self.chosen: Tensor | None = None
 
     def read(self, context: Tensor) -> None:
         """Add transitions [n, T, F] of each task to its context."""
@@ -115,9 +119,14 @@ class _Adaptation:
         self.count += context.shape[1]
 
     @property
+    def context(self) -> Tensor:
+        """The contexts so far, [n, Z]; 0 before any transition."""
+        return (self.total / self.count.clamp_min(1.0)).float()
+
+    @property
     def told(self) -> Tensor:
-        """What the policy is told: contexts so far, [n, Z]; 0 before any transition."""
-        mean = (self.total / self.count.clamp_min(1.0)).float()
+        """What the policy is told when it is scored: the contexts, or what was chosen, [n, Z]."""
+        mean = self.context if self.chosen is None else self.chosen
         return self.encoder.told(mean, self.params)
 
     @property
@@ -160,15 +169,17 @@ class _Adaptation:
         """Returns [n] of one deterministic episode on the contexts so far."""
         return self.episode(self.deterministic(self.z), explore=False)
 
-    def explore(self, protocol: Protocol, config: MetaTestConfig) -> Exploration:
+    def explore(self, group: Group, config: MetaTestConfig) -> Exploration:
         """Fill the contexts; gives the returns [n] that the curve has before its last."""
         curve: list[Floats] = []
         episodes = config.random_episodes + config.policy_episodes
-        if protocol == "online":
+        if group.codes is not None:
+            curve = yield from self._explore_codes(group.codes, config)
+        elif group.protocol == "online":
             for _ in range(episodes):
                 act = self.deterministic(self.z)
                 curve.append((yield from self.episode(act, explore=True)))
-        elif protocol == "np_online":
+        elif group.protocol == "np_online":
             for number in range(episodes):
                 curve.append((yield from self.score()))
                 random = number < config.random_episodes
@@ -176,9 +187,32 @@ class _Adaptation:
                 yield from self.episode(act, explore=True)
         return curve
 
-    def episodes(self, protocol: Protocol, config: MetaTestConfig) -> Episodes:
+    def _explore_codes(self, codes: Tensor, config: MetaTestConfig) -> Exploration:
+        """Act on codes [N, Z] in turn, then on the context of the episode that returned most.
+
+        Chosen for the score is what the policy was told in that episode.
+        """
+        curve: list[Floats] = []
+        best = np.full(self.size, -np.inf)
+        for number in range(config.random_episodes + config.policy_episodes):
+            curve.append((yield from self.score()))
+            on_code = number < config.random_episodes
+            told = codes[number % len(codes)].expand(self.size, -1) if on_code else self.context
+            before = self.total, self.count, told if self.chosen is None else self.chosen
+            self.total, self.count = torch.zeros_like(self.total), torch.zeros_like(self.count)
+            act = self.stochastic(self.encoder.scaled(told))
+            returns = yield from self.episode(act, explore=True)
+            better = torch.from_numpy(returns > best)[:, None]
+            after = self.total, self.count, told
+            self.total, self.count, self.chosen = (
+                torch.where(better, new, old) for new, old in zip(after, before, strict=True)
+            )
+            best = np.maximum(best, returns)
+        return curve
+
+    def episodes(self, group: Group, config: MetaTestConfig) -> Episodes:
         """The whole adaptation."""
-        curve = yield from self.explore(protocol, config)
+        curve = yield from self.explore(group, config)
         last = []
         for _ in range(config.scored_episodes):
             last.append((yield from self.score()))
@@ -229,11 +263,14 @@ class MetaTest:
             each_step: called before each step; what it raises ends the meta-test.
 
         Raises:
-            ValueError: an offline group without data, or another one with data.
+            ValueError: an offline group without data, one of `codes` without codes, or another one
+                with either.
         """
         for name, group in groups.items():
             if (group.protocol == "offline") != (group.data is not None):
                 raise ValueError(f"group {name!r}: offline contexts need data, no others take any")
+            if (group.protocol == "codes") != (group.codes is not None):
+                raise ValueError(f"group {name!r}: 'codes' needs codes, no others take any")
         repetitions = self.config.repetitions
         rows = {name: np.tile(group.rows, repetitions) for name, group in groups.items()}
         every = np.concatenate([*rows.values()])
@@ -249,7 +286,7 @@ class MetaTest:
             adaptation = _Adaptation(env, place, self)
             if group.data is not None:
                 adaptation.read(group.data)
-            episodes = adaptation.episodes(group.protocol, self.config)
+            episodes = adaptation.episodes(group, self.config)
             actions[place] = next(episodes)
             at_work[name] = adaptation, episodes
         results: dict[str, MetaTestResult] = {}

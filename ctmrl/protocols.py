@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal
 
-Protocol = Literal["np_online", "online", "offline"]
-"""How contexts come about, by the names that the field's code (CSRO's) has: by episodes of random
-actions and then of the policy, of the deterministic policy alone, or by the task's own data."""
+Protocol = Literal["np_online", "online", "offline", "codes"]
+"""How contexts come about, the first three by the names that the field's code (CSRO's) has: by
+episodes of random actions and then of the policy, of the deterministic policy alone, by the task's
+own data; or by episodes that act on the codes, of which those that return most count."""
 
 NP_ONLINE: Mapping[Protocol, None] = MappingProxyType({"np_online": None})
 """The protocol that training ends with, which needs no data."""

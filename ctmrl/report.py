@@ -100,7 +100,7 @@ def write_pictures(record: dict[str, Any], folder: Path) -> None:
     from datagen.dataset import write_whole
 
     pictures = {"adaptation.png": adaptation_figure, "contexts.png": context_figure}
-    if not record["protocol"]["random_episodes"] + record["protocol"]["policy_episodes"]:
+    if all(len(group["curve"]) == 1 for group in record["groups"].values()):
         del pictures["adaptation.png"]
     for name, draw in pictures.items():
         buffer = BytesIO()
@@ -138,9 +138,13 @@ def _draw_curve(axes: Axes, name: str, group: dict[str, Any], record: dict[str, 
         if key in group["references"]:
             value = group["references"][key]
             axes.axhline(value, color="0.35", ls=style, lw=1, label=f"{LABELS[key]} {value:.2f}")
-    change = record["protocol"]["random_episodes"]
-    if 0 < change < len(mean) - 1:
-        axes.axvspan(0, change, color="0.93", lw=0, zorder=0, label="random actions")
+    for first, said in (
+        ("random_episodes", "random actions"),
+        ("code_episodes", "acting on codes"),
+    ):
+        change = record["protocol"].get(first, 0)
+        if 0 < change < len(mean) - 1:
+            axes.axvspan(0, change, color="0.93", lw=0, zorder=0, label=said)
     near = [value for key, value in group["references"].items() if key != "random"]
     # The first points, on an empty context, may lie far below: cut them off rather than the rest.
     top, bottom = max([*near, mean.max()]), min([*near, mean[1:].min(initial=mean[-1])])

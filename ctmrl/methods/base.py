@@ -114,6 +114,11 @@ class Method(nn.Module, ABC):
         """
         return None
 
+    @property
+    def codes(self) -> Tensor | None:
+        """The cross-task contexts, [N, Z]; None where a method has none."""
+        return None
+
     def code_of(self, z: Tensor) -> Tensor | None:
         """Code of each context [*, Z], int64 [*]; None where a method has no codes."""
         return None

@@ -160,6 +160,11 @@ class CTMRL(Method):
         means = per_task.mean(dim=1)
         return means[0], means[1] if many == 2 else torch.zeros((), device=z.device)
 
+    @property
+    def codes(self) -> Tensor:
+        """The codebook's, [N, Z]."""
+        return self.codebook.codes.detach()
+
     def code_of(self, z: Tensor) -> Tensor:
         """Equation (1)."""
         return self.codebook.match(z)

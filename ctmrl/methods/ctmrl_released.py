@@ -200,6 +200,11 @@ class CTMRLReleased(Method):
         encodings: Tensor = self.encoder(predicted)
         return encodings
 
+    @property
+    def codes(self) -> Tensor:
+        """The codebook's, [N, Z]."""
+        return self.codebook.codes.detach()
+
     def code_of(self, z: Tensor) -> Tensor:
         """The code nearest by cosine."""
         return self.codebook.match(z)

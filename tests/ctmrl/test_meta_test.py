@@ -334,6 +334,7 @@ def test_a_group_beside_others_is_what_it_is_alone(
         "many": Group(np.array([9, 4, 1, 2, 8, 0, 7])),
         "online": Group(ROWS, "online"),
         "offline": Group(ROWS, "offline", data),
+        "codes": Group(ROWS, "codes", codes=torch.rand(2, Z, generator=torch.Generator())),
     }
     alone: dict[str, MetaTestResult] = {}
     lengths: dict[str, int] = {}
@@ -355,7 +356,7 @@ def test_a_group_beside_others_is_what_it_is_alone(
     assert not same(alone["few"], dataclasses.replace(test, seed=SEED + 1).run(groups)["few"])
     few, many = ([*groups[name].rows].index(4) for name in ("few", "many"))
     assert alone["few"].returns[0, few] != alone["many"].returns[0, many]
-    for one, other in itertools.combinations(("few", "online", "offline"), 2):
+    for one, other in itertools.combinations(("few", "online", "offline", "codes"), 2):
         assert (alone[one].returns != alone[other].returns).any(), (one, other)
 
 

@@ -113,7 +113,7 @@ def test_all_protocols_in_one_pass(
     run: Path, wind_path: Path, commands: Commands, tmp_path: Path
 ) -> None:
     words = ("ctmrl.evaluate", str(run), "--data", str(wind_path), "--protocols")
-    together, names = tmp_path / "together", ("offline", "np_online", "online")
+    together, names = tmp_path / "together", ("offline", "np_online", "online", "codes")
     assert commands.run(*words, *names, "--out", str(together)) == 0, commands.output()
     for title in ("ctmrl, offline, seed 0", "ctmrl, seed 0", "ctmrl, online, seed 0"):
         assert title in commands.output()
@@ -126,7 +126,7 @@ def test_all_protocols_in_one_pass(
         record = json.loads(found["evaluation.json"])
         assert record["protocol"]["name"] == name
         returns.add(record["groups"]["unseen"]["return"])
-    assert len(returns) == 3
+    assert len(returns) == 4
     # np_online is what training ends with.
     trained = contents(run)["evaluation.json"]
     assert contents(together / "np_online")["evaluation.json"] == trained

@@ -151,6 +151,18 @@ def test_the_adaptation_figure() -> None:
         assert low > wind_blind - 20.0
 
 
+@pytest.mark.parametrize(
+    ("first", "label"),
+    [("random_episodes", "random actions"), ("code_episodes", "acting on codes")],
+)
+def test_the_adaptation_figure_says_what_came_first(first: str, label: str) -> None:
+    shown = record()
+    shown["protocol"] |= {"random_episodes": 0, first: 2}
+    for axes in adaptation_figure(shown).axes:
+        said = texts(axes)
+        assert [one for one in ("random actions", "acting on codes") if one in said] == [label]
+
+
 @pytest.mark.parametrize(("method", "panels"), [("ctmrl", 2), ("focal", 1)])
 def test_the_context_figure_with_and_without_codes(method: str, panels: int) -> None:
     shown = record(method)
