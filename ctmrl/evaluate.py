@@ -280,7 +280,8 @@ def main(config: EvaluateConfig) -> None:
         )
     if "codes" in config.protocols and agent.method.codes is None:
         raise UsageError(
-            f"--protocols codes is for methods with a codebook, and {run_config.method} has none"
+            f"--protocols codes acts on a codebook, and {config.run} has none in use: "
+            "it is for runs of ctmrl and ctmrl_released that are past their warm-up"
         )
     if config.fresh:
         tasks = tasks.sample(seed, config.fresh)

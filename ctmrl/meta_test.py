@@ -20,7 +20,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MetaTestConfig:
-    """How much an agent may explore a task before it is scored; `online` has as many episodes."""
+    """How much an agent may explore a task before it is scored, as np_online does.
+
+    The other protocols that explore have as many episodes.
+    """
 
     random_episodes: int = 10
     """Phase one: episodes of uniformly random actions."""
@@ -94,7 +97,7 @@ Episodes = Generator[NDArray[np.float32], _Seen, MetaTestResult]
 
 
 class _Adaptation:
-    """Tasks side by side in some rows of a vector environment, each with a context that grows.
+    """Tasks side by side in some rows of a vector environment, each with a context of its own.
 
     Its random numbers, its environments and its batches for the networks are its own, so that what
     the other rows hold does not change a bit of it.
@@ -112,6 +115,7 @@ class _Adaptation:
         self.total = torch.zeros(self.size, self.encoder.z_dim, dtype=torch.float64)
         self.count = torch.zeros(self.size, 1, dtype=torch.float64)
         self.chosen: Tensor | None = None
+        """What the policy is told in place of contexts, [n, Z]."""
 
     def read(self, context: Tensor) -> None:
         """Add transitions [n, T, F] of each task to its context."""
@@ -166,14 +170,14 @@ class _Adaptation:
         return returns
 
     def score(self) -> Episode:
-        """Returns [n] of one deterministic episode on the contexts so far."""
+        """Returns [n] of one deterministic episode on what the policy is told now."""
         return self.episode(self.deterministic(self.z), explore=False)
 
     def explore(self, group: Group, config: MetaTestConfig) -> Exploration:
         """Fill the contexts; gives the returns [n] that the curve has before its last."""
         curve: list[Floats] = []
         episodes = config.random_episodes + config.policy_episodes
-        if group.codes is not None:
+        if group.protocol == "codes" and group.codes is not None:
             curve = yield from self._explore_codes(group.codes, config)
         elif group.protocol == "online":
             for _ in range(episodes):
@@ -190,15 +194,16 @@ class _Adaptation:
     def _explore_codes(self, codes: Tensor, config: MetaTestConfig) -> Exploration:
         """Act on codes [N, Z] in turn, then on the context of the episode that returned most.
 
-        Chosen for the score is what the policy was told in that episode.
+        Chosen for the score is what the policy was told in that episode, the earliest of equals.
         """
         curve: list[Floats] = []
+        self.chosen = self.context
         best = np.full(self.size, -np.inf)
         for number in range(config.random_episodes + config.policy_episodes):
             curve.append((yield from self.score()))
             on_code = number < config.random_episodes
             told = codes[number % len(codes)].expand(self.size, -1) if on_code else self.context
-            before = self.total, self.count, told if self.chosen is None else self.chosen
+            before = self.total, self.count, self.chosen
             self.total, self.count = torch.zeros_like(self.total), torch.zeros_like(self.count)
             act = self.stochastic(self.encoder.scaled(told))
             returns = yield from self.episode(act, explore=True)

@@ -7,7 +7,7 @@ from typing import Literal
 Protocol = Literal["np_online", "online", "offline", "codes"]
 """How contexts come about, the first three by the names that the field's code (CSRO's) has: by
 episodes of random actions and then of the policy, of the deterministic policy alone, by the task's
-own data; or by episodes that act on the codes, of which those that return most count."""
+own data; or by the best of episodes that act on the codes and then on contexts."""
 
 NP_ONLINE: Mapping[Protocol, None] = MappingProxyType({"np_online": None})
 """The protocol that training ends with, which needs no data."""

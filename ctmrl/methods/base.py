@@ -116,7 +116,7 @@ class Method(nn.Module, ABC):
 
     @property
     def codes(self) -> Tensor | None:
-        """The cross-task contexts, [N, Z]; None where a method has none."""
+        """The cross-task contexts, [N, Z]; None where a method has none, or none in use yet."""
         return None
 
     def code_of(self, z: Tensor) -> Tensor | None:

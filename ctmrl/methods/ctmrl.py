@@ -161,9 +161,9 @@ class CTMRL(Method):
         return means[0], means[1] if many == 2 else torch.zeros((), device=z.device)
 
     @property
-    def codes(self) -> Tensor:
-        """The codebook's, [N, Z]."""
-        return self.codebook.codes.detach()
+    def codes(self) -> Tensor | None:
+        """The codebook's, [N, Z]; None before the warm-up is over."""
+        return self.codebook.codes.detach() if self.codebook.placed else None
 
     def code_of(self, z: Tensor) -> Tensor:
         """Equation (1)."""

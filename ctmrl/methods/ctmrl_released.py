@@ -201,9 +201,9 @@ class CTMRLReleased(Method):
         return encodings
 
     @property
-    def codes(self) -> Tensor:
-        """The codebook's, [N, Z]."""
-        return self.codebook.codes.detach()
+    def codes(self) -> Tensor | None:
+        """The codebook's, [N, Z]; None before the warm-up is over."""
+        return self.codebook.codes.detach() if self.codebook.placed else None
 
     def code_of(self, z: Tensor) -> Tensor:
         """The code nearest by cosine."""

@@ -171,6 +171,28 @@ def test_the_walkers_contexts_form_early_and_differ(config: RunConfig) -> None:
         assert config.context.warm_up == 0.3
 
 
+def test_the_sparse_robots_first_episodes_may_act_on_a_code_each() -> None:
+    config = preset("sparse_point_robot", "ctmrl", "standard")
+    assert isinstance(config.context, CTMRLConfig)
+    assert config.context.codes == config.meta_test.random_episodes == 10
+    assert (config.training.context_episodes, config.training.context_size) == (10, 200)
+    assert config.context.squared_errors
+
+
+@pytest.mark.parametrize("method", ["ctmrl", "ctmrl_released"])
+@pytest.mark.parametrize(
+    ("env", "codes"),
+    [("sparse_point_robot", (10, 4, 3)), ("walker_params", (4, 4, 3)), ("ant_goal", (2, 2, 2))],
+)
+def test_codes_of_standard_paper_and_smoke(env: str, codes: tuple[int, ...], method: str) -> None:
+    found = []
+    for name in ("standard", "paper", "smoke"):
+        context = preset(env, method, known_preset(name)).context
+        assert isinstance(context, CTMRLConfig | CTMRLReleasedConfig)
+        found.append(context.codes)
+    assert tuple(found) == codes
+
+
 def test_a_run_from_before_contexts_could_be_standardised_has_them_as_they_are() -> None:
     config = preset("walker_params", "ctmrl", "standard", precision="float32")
     stored = through_a_file(config)

@@ -163,6 +163,16 @@ def test_the_adaptation_figure_says_what_came_first(first: str, label: str) -> N
         assert [one for one in ("random actions", "acting on codes") if one in said] == [label]
 
 
+@pytest.mark.parametrize(("points", "drawn"), [(3, True), (1, False)])
+def test_exploration_of_any_kind_is_drawn(points: int, drawn: bool, tmp_path: Path) -> None:
+    shown = record()
+    shown["protocol"] |= {"random_episodes": 0, "policy_episodes": 0, "code_episodes": points - 1}
+    for group in shown["groups"].values():
+        group["curve"] = group["curve"][:points]
+    write_pictures(shown, tmp_path)
+    assert (tmp_path / "adaptation.png").exists() is drawn
+
+
 @pytest.mark.parametrize(("method", "panels"), [("ctmrl", 2), ("focal", 1)])
 def test_the_context_figure_with_and_without_codes(method: str, panels: int) -> None:
     shown = record(method)
