@@ -35,8 +35,8 @@ train: $(VENV)/.installed
 	@$(BIN)/python -m ctmrl.train
 
 test: $(VENV)/.installed-dev
-	@echo "Running the fast tests (pytest) ..."
-	@$(BIN)/python -m pytest
+	@echo "Running the fast tests (pytest, a process for each of up to 4 cores) ..."
+	@$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 slow: $(VENV)/.installed-dev
 	@echo "Running the slow tests (pytest -m slow) ..."
