@@ -152,10 +152,11 @@ def check_loggers(names: Sequence[str]) -> None:
 
 
 class Loggers:
-    """The loggers of a run, which get every row once, however often the run is interrupted.
+    """The loggers of a run, which get a row once at most, however often the run is interrupted.
 
     A run that goes on takes the steps after its last checkpoint again. So a row waits until the
-    checkpoint behind it is written.
+    checkpoint behind it is written; one killed between the two is in metrics.csv alone, as the last
+    row of a run that diverges.
     """
 
     def __init__(self, loggers: Sequence[MetricLogger]) -> None:

@@ -351,8 +351,9 @@ def meta_train(
         sound = {key: value.clone() for key, value in learner.state().items()}
         try:
             row = _advance(learner, log_every)
-        except Exception:
-            # What went wrong first may be steps behind what was noticed.
+        except ValueError:
+            # It diverged, or K-means was given what is not finite. What went wrong first may be
+            # steps behind what was noticed.
             learner.retrace(sound)
             raise
         yield row

@@ -204,6 +204,8 @@ def _compare(path: Path, there: dict[str, Any], asked: dict[str, Any]) -> None:
     # Through JSON, because a tuple comes back as a list.
     unsaid = flatten({"settings": LATER_SETTINGS})
     flat, wanted = (unsaid | flatten(one) for one in (there, json.loads(to_json(asked))))
+    # Runs did not name it before; what they do not name is no difference.
+    flat.setdefault("versions.mujoco", wanted.get("versions.mujoco"))
     # Settings first: the lists of tasks follow from them.
     for key in sorted(flat.keys() | wanted.keys(), key=lambda k: (not k.startswith("settings"), k)):
         if flat.get(key) != wanted.get(key):
@@ -261,6 +263,11 @@ class RunFolder:
     def close(self) -> None:
         """Let others use the folder."""
         os.close(self._lock)
+
+    def abandon(self) -> None:
+        """Leave nothing of a run that has no checkpoint yet, so that other settings may have it."""
+        if not (self.path / CHECKPOINT).exists():
+            self._throw_away()
 
     def _throw_away(self) -> None:
         _refuse_to_throw_away(self.path)

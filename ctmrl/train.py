@@ -28,6 +28,7 @@ LOGS, CHECKPOINTS, RETURNS = 100, 50, 10
 NOT_SETTINGS = {"data", "out", "restart", "loggers", "memory", "seeds", "workers", "beside"}
 """Fields of RunConfig that do not change a run's results."""
 PACKAGES = ("ctmrl", "numpy", "torch", "gymnasium", "scikit-learn")
+"""What a run's bytes depend on; those of MuJoCo's robots also on mujoco."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,12 @@ def best_behavior(dataset: Dataset) -> dict[int, float]:
 def known_settings(config: RunConfig, dataset: Dataset, split: Split) -> dict[str, Any]:
     """All that decides the run's results and is known before the data are read."""
     from ctmrl.settings import without_later_settings
+    from meta_envs.mujoco_robot import MujocoRobot
+    from meta_envs.registry import definition
 
+    packages = (
+        (*PACKAGES, "mujoco") if isinstance(definition(dataset.env), MujocoRobot) else PACKAGES
+    )
     # Of a device such as cuda:1, what decides the bytes.
     every = {**dataclasses.asdict(config), "device": config.device.partition(":")[0]}.items()
     return {
@@ -79,7 +85,7 @@ def known_settings(config: RunConfig, dataset: Dataset, split: Split) -> dict[st
         "dataset": dataset.hash,
         "groups": {"unseen": split.unseen.tolist(), "seen": split.train.tolist()},
         "best_behavior": {str(task): value for task, value in best_behavior(dataset).items()},
-        "versions": {name: metadata.version(name) for name in PACKAGES},
+        "versions": {name: metadata.version(name) for name in packages},
     }
 
 
@@ -114,10 +120,11 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
     Raises:
         UsageError: settings or a dataset that cannot be used.
         Diverged: a quantity that is not finite, or a Q beyond what rewards explain.
+        OutOfMemory: it takes more memory than there is; it leaves no run without a checkpoint.
     """
     from ctmrl import runs
     from ctmrl.data import OfflineData
-    from ctmrl.errors import Diverged
+    from ctmrl.errors import Diverged, OutOfMemory, within_memory
     from ctmrl.meta_train import Learner
     from ctmrl.table import Room
     from ctmrl.threads import settle_threads
@@ -137,7 +144,8 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
         config.context.dense_reward_in_context,
         Room(config.memory, path),
     )
-    learner = Learner(config, data)
+    with within_memory():
+        learner = Learner(config, data)
     settings = {**known, "dimensions": learner.method.dims._asdict()}
     folder = runs.RunFolder(path, settings, config.restart)
     try:
@@ -146,10 +154,15 @@ def train(config: RunConfig, console: Console, watch: Watch | None = None) -> di
         if data.in_file:
             console.print("The training data are read from a file; more --memory avoids it.")
         try:
-            _meta_train(config, learner, folder, console, watch)
+            with within_memory():
+                _meta_train(config, learner, folder, console, watch)
         except Diverged as error:
             raise Diverged(f"training diverged: {error}; {_way_on(folder)}") from None
-        return _evaluate(config, learner, folder, split, best_behavior(dataset))
+        except OutOfMemory:
+            folder.abandon()
+            raise
+        with within_memory():
+            return _evaluate(config, learner, folder, split, best_behavior(dataset))
     finally:
         folder.close()
 

@@ -147,7 +147,7 @@ def check(path: Path) -> tuple[Findings, str]:
         if dataset is None:
             return findings, ""
         train, test = len(dataset.train_tasks), len(dataset.test_tasks)
-        about = f"{dataset.env}, {train + test} tasks ({train} train, {test} test)"
+        about = f"{dataset.env}, {len(dataset.tasks)} tasks ({train} train, {test} test)"
         digest = dataset.hash
     return findings, f"{path}: ok: {about}, {findings.counts()}, SHA-256 {digest[:16]}"
 

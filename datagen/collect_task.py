@@ -88,7 +88,7 @@ def collect_task(job: Job, report: Callable[[int], None] = lambda step: None) ->
         **origin(job.env, job.budget, job.seed),
         "task": job.task,
         "params": tasks.params[job.task].tolist(),
-        "split": "test" if job.task in tasks.test_tasks else "train",
+        "split": tasks.split_of(job.task),
         "returns": returns,
     }
     if job.budget.fleet:

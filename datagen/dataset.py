@@ -37,6 +37,7 @@ from datagen.records import FORMAT_VERSION, check_index, check_version
 from datagen.slices import QUALITIES, Quality, Slice, take
 from datagen.stream import BLOCK_ROWS, Episodes, no_slice, open_file, open_task
 from datagen.task_files import NOT_WRITTEN, parse_task, read_task, remake, write_task
+from meta_envs import task_set
 
 __all__ = [
     "COLUMNS",
@@ -99,7 +100,8 @@ class Dataset:
         env: short name of the environment.
         tasks: the tasks it has, sorted rows of the environment's task set, int64 [n].
         train_tasks: those of them that are for meta-training, sorted, int64.
-        test_tasks: the others, for meta-testing, sorted, int64.
+        test_tasks: those that are for meta-testing, sorted, int64: the others, or where an
+            environment trains and tests on the same tasks, the same.
         params: parameters of `tasks`, float64 [n, P].
         part: which rows of each task are read; all by default.
     """
@@ -337,18 +339,17 @@ def open_dataset(path: Path | str, verify: bool = True) -> Dataset:
     """
     folder = Path(path)
     index = _read_index(folder)
-    train, test = (
-        np.array([r["task"] for r in index["tasks"] if r["split"] == split], dtype=np.int64)
-        for split in ("train", "test")
-    )
+    records = index["tasks"]
+    tasks = np.array([record["task"] for record in records], dtype=np.int64)
+    learned = np.array([record["split"] == "train" for record in records], dtype=bool)
     dataset = Dataset(
         path=folder,
         index=index,
         env=index["env"],
-        tasks=np.union1d(train, test),
-        train_tasks=train,
-        test_tasks=test,
-        params=np.array([record["params"] for record in index["tasks"]], dtype=np.float64),
+        tasks=tasks,
+        train_tasks=tasks[learned],
+        test_tasks=np.intersect1d(tasks, task_set(index["env"]).test_tasks),
+        params=np.array([record["params"] for record in records], dtype=np.float64),
     )
     if verify:
         for task in dataset.tasks.tolist():

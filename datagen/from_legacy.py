@@ -179,7 +179,7 @@ def _task_data(
         **shared,
         "task": one.task,
         "params": tasks.params[one.task].tolist(),
-        "split": "test" if one.task in tasks.test_tasks else "train",
+        "split": tasks.split_of(one.task),
         "returns": {
             "random": anchors["random"],
             "expert": anchors.get("oracle", max(known.values())),

@@ -120,7 +120,7 @@ def _check_task(record: Mapping[str, Any], tasks: TaskSet) -> None:
         or (np.abs(np.asarray(params, np.float64) - wanted) > 1e-8).any()
     ):
         raise ValueError(f"task {task} has the parameters {params!a}, not {wanted.tolist()}")
-    split = "test" if task in tasks.test_tasks else "train"
+    split = tasks.split_of(task)
     if record["split"] != split:
         raise ValueError(f"task {task} is in split {record['split']!a}, not '{split}'")
     _check_returns(record["returns"], task)

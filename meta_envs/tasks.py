@@ -186,6 +186,11 @@ class TaskSet:
         """Sorted rows of the default split's meta-training tasks, int64 [n_train], read-only."""
         return self.splits[DEFAULT_SPLIT].train_tasks
 
+    def split_of(self, task: int) -> str:
+        """The default split's side that a task's data are on, "train" where it is on both."""
+        alone = task in self.test_tasks and task not in self.train_tasks
+        return "test" if alone else "train"
+
     @property
     def hash(self) -> str:
         """SHA-256 over the environment, the parameters (to nine decimals) and the splits."""

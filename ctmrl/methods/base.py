@@ -120,7 +120,7 @@ class Method(nn.Module, ABC):
         return None
 
     def code_of(self, z: Tensor) -> Tensor | None:
-        """Code of each context [*, Z], int64 [*]; None where a method has no codes."""
+        """Code of each context [*, Z], int64 [*]; None where `codes` is."""
         return None
 
 

@@ -165,6 +165,6 @@ class CTMRL(Method):
         """The codebook's, [N, Z]; None before the warm-up is over."""
         return self.codebook.codes.detach() if self.codebook.placed else None
 
-    def code_of(self, z: Tensor) -> Tensor:
-        """Equation (1)."""
-        return self.codebook.match(z)
+    def code_of(self, z: Tensor) -> Tensor | None:
+        """Equation (1); None before the warm-up is over."""
+        return self.codebook.match(z) if self.codebook.placed else None

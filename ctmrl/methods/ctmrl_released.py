@@ -205,6 +205,6 @@ class CTMRLReleased(Method):
         """The codebook's, [N, Z]; None before the warm-up is over."""
         return self.codebook.codes.detach() if self.codebook.placed else None
 
-    def code_of(self, z: Tensor) -> Tensor:
-        """The code nearest by cosine."""
-        return self.codebook.match(z)
+    def code_of(self, z: Tensor) -> Tensor | None:
+        """The code nearest by cosine; None before the warm-up is over."""
+        return self.codebook.match(z) if self.codebook.placed else None

@@ -16,9 +16,9 @@ Defects that the field's code bases share or hand on:
 |---|---|---|
 | 1 | environments reseed the generator everyone shares | `test_f1_...`, tests/meta_envs |
 | 2 | the time limit is stored as a real end | `test_f2_...` |
-| 3 | contact costs that vanish | of MuJoCo's environments, not here yet |
-| 4 | inertia drawn apart from mass, friction of the floor | of MuJoCo's environments |
-| 5 | a frame skip that is asked for and not used | of MuJoCo's environments |
+| 3 | contact costs that vanish | tests/meta_envs/test_ant.py, test_humanoid.py |
+| 4 | inertia drawn apart from mass, friction of the floor | tests/meta_envs/test_rand_params.py |
+| 5 | a frame skip that is asked for and not used | tests/meta_envs/test_simulation.py |
 | 6 | a goal radius of the wrong sign | tests/meta_envs/test_point_robot.py |
 | 7 | batches without repetition leave FOCAL no positive pairs | `test_f7_...` |
 | 8 | the multiplier winds up; a penalty on the value, not the gradient | `test_f8_...` |
@@ -29,7 +29,7 @@ Defects that the field's code bases share or hand on:
 | 13 | the order of a folder's listing is the order of the tasks | `test_f13_...` |
 | 14 | observations are scaled after a step but not after a reset | `test_f14_...` |
 | 15 | episodes that end early shift the evaluation's counters | `test_f15_...` |
-| 16 | models that newer MuJoCo releases refuse | of MuJoCo's environments |
+| 16 | models that newer MuJoCo releases refuse | tests/meta_envs/test_simulation.py |
 | 17 | seeds that do not reach the reset | `test_f17_...` |
 | 18 | all tasks have one goal: only r and s' tell the wind | `test_f18_...` |
 """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 import shutil
 import subprocess
 import sys
@@ -9,20 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
+from torch import Tensor
 
 from ctmrl import train as command
 from ctmrl.config import RunConfig
 from ctmrl.console import run_command
+from ctmrl.errors import OutOfMemory
+from ctmrl.meta_train import Learner
 from ctmrl.methods import METHODS
 from ctmrl.methods.ctmrl import CTMRLConfig
 from ctmrl.methods.focal import FOCALConfig
 from ctmrl.presets import preset
-from ctmrl.runs import RunFolder, read_json
+from ctmrl.runs import RunFolder, load_checkpoint, read_json
 from ctmrl.train import parse
 from datagen.dataset import task_file
 from meta_envs import ENVIRONMENTS
 from tests.ctmrl.commands import Commands
 from tests.ctmrl.conftest import FinishedRun
+from tests.ctmrl.examples import smoke
 from tests.datagen.examples import write_dataset
 
 
@@ -105,6 +112,40 @@ def test_mistakes_are_one_sentence_and_leave_nothing(
 ) -> None:
     assert mistake(*words) == said
     assert not (tmp_path / "out").exists()
+
+
+TOO_LARGE = (
+    "this takes more memory than there is: lower --batch-size, --meta-batch, --context-size, "
+    "--repetitions or the widths of the networks (--hidden and others)"
+)
+
+
+@pytest.mark.parametrize("size", ["100000000000", "1000000000000000000"])
+@pytest.mark.parametrize("option", ["--batch-size", "--context-size", "--encoder-hidden"])
+def test_sizes_beyond_memory_are_one_sentence_and_leave_no_run(
+    option: str, size: str, mistake: Any, tmp_path: Path
+) -> None:
+    assert mistake(option, size) == TOO_LARGE
+    # The corrected command may have the folder.
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_a_run_that_outgrows_memory_later_keeps_its_checkpoint(
+    wind_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(learner: Learner) -> dict[str, Tensor]:
+        if learner.step == 20:
+            raise MemoryError
+        return whole(learner)
+
+    whole = Learner.update
+    monkeypatch.setattr(Learner, "update", refused)
+    config = smoke(40, data=wind_path, out=tmp_path, beside="never")
+    with pytest.raises(OutOfMemory, match=f"^{re.escape(TOO_LARGE)}$"):
+        command.train(config, Console(file=io.StringIO()))
+    assert 0 < load_checkpoint(tmp_path / "checkpoint.pt")["step"] <= 20
+    monkeypatch.undo()
+    command.train(config, Console(file=io.StringIO()))
 
 
 def test_wrong_data_is_one_sentence(

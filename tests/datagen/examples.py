@@ -30,10 +30,11 @@ def task_data(
         env, tasks=[task] * episodes, autoreset_mode=AutoresetMode.DISABLED, task_set=tasks
     )
     generator = np.random.default_rng([seed, task])
+    size = (episodes, *(many.single_action_space.shape or ()))
     steps: dict[str, list[NDArray[Any]]] = {name: [] for name in COLUMNS}
     obs, _ = many.reset(seed=seed)
     for _ in range(row.horizon):
-        action = generator.uniform(-1.0, 1.0, (episodes, 2)).astype(np.float32)
+        action = generator.uniform(-1.0, 1.0, size).astype(np.float32)
         next_obs, reward, terminated, truncated, info = many.step(action)
         number = np.arange(episodes)
         values = [obs, action, reward, next_obs, terminated, truncated, number]
@@ -69,7 +70,7 @@ def _meta(
         "params": tasks.params[task].tolist(),
         "param_names": list(tasks.param_names),
         "task_hash": tasks.hash,
-        "split": "test" if task in tasks.test_tasks else "train",
+        "split": tasks.split_of(task),
         "seed": seed,
         "config": {"policy": "random", "episodes": episodes},
         "versions": {"numpy": np.__version__},

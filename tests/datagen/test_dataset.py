@@ -329,6 +329,18 @@ def test_500_random_accidents_are_all_refused(folder: Path, tmp_path: Path) -> N
     assert befallen == set(accidents.whole)
 
 
+def test_tasks_that_are_for_training_and_for_the_test_are_both(tmp_path: Path) -> None:
+    """HalfCheetahDir's two directions, as the field has them; ant_dir's are one or the other."""
+    dataset = open_dataset(write_dataset(tmp_path / "both", (0, 1), "half_cheetah_dir", 2))
+    for rows in (dataset.tasks, dataset.train_tasks, dataset.test_tasks):
+        assert rows.tolist() == [0, 1]
+    assert [record["split"] for record in dataset.index["tasks"]] == ["train", "train"]
+    others = task_set("ant_dir")
+    on_both = {"train": others.train_tasks.tolist(), "test": others.test_tasks.tolist()}
+    for side, rows in on_both.items():
+        assert {others.split_of(task) for task in rows} == {side}
+
+
 def test_the_documented_snippets_work(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -372,4 +372,8 @@ def test_without_kmeans_codes_stay_random_unit_vectors_and_nothing_is_collected(
 
 def test_code_of_is_equation_1() -> None:
     method, z = ctmrl(), normal(BATCH, Z).float()
-    assert method.code_of(z).equal(cqvae.match(z, method.codebook.codes))
+    assert method.code_of(z) is None
+    method.codebook.placed.fill_(True)
+    found = method.code_of(z)
+    assert found is not None
+    assert found.equal(cqvae.match(z, method.codebook.codes))

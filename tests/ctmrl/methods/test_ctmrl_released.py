@@ -372,6 +372,7 @@ def test_a_decay_out_of_its_range_is_one_sentence(decay: float) -> None:
 def test_code_of_is_the_nearest_by_cosine() -> None:
     method, z = placed(), normal(BATCH, Z)
     found = method.code_of(z)
+    assert found is not None
     for context, code in zip(z, found, strict=True):
         near = functional.cosine_similarity(context[None], method.codebook.codes)
         assert near.argmax() == code
