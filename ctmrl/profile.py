@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import tyro
 
 if TYPE_CHECKING:
+    import torch
     from rich.console import Console
     from rich.table import Table
 
@@ -64,6 +65,9 @@ class ProfileConfig:
     """Threads of the numerical libraries."""
     precision: Literal["auto", "float32", "bfloat16"] | None = None
     """Of the networks' matrix products; default that of python -m ctmrl.train."""
+    device: str = "cpu"
+    """cpu or cuda, such as cuda:1. On a GPU the table has a step's parts one after the other, and
+    below it is how fast the step is as training takes it, as one CUDA graph."""
     data: Path | None = None
     """Dataset folder; default datasets/<environment>."""
     trace: Path | None = None
@@ -85,9 +89,16 @@ class Stopwatch:
         flops: the same, while `counted` says how many there were so far.
     """
 
-    def __init__(self, counted: Callable[[], int] = lambda: 0) -> None:
-        """Start it in what is no part."""
-        self._counted = counted
+    def __init__(
+        self, counted: Callable[[], int] = lambda: 0, settle: Callable[[], None] = lambda: None
+    ) -> None:
+        """Start it in what is no part.
+
+        Args:
+            counted: FLOPs so far.
+            settle: waits until all that was begun is done.
+        """
+        self._counted, self._settle = counted, settle
         self._open = [REST]
         self.restart()
 
@@ -99,6 +110,7 @@ class Stopwatch:
 
     def edge(self) -> None:
         """Give what passed since the last edge to the innermost part that is open."""
+        self._settle()
         now = (time.perf_counter(), self._counted())
         self.seconds[self._open[-1]] += now[0] - self._since[0]
         self.flops[self._open[-1]] += now[1] - self._since[1]
@@ -166,6 +178,20 @@ def watched(learner: Learner, stopwatch: Stopwatch) -> Iterator[None]:
         yield
 
 
+def settling(device: torch.device) -> Callable[[], None]:
+    """What waits until a device has done all that was begun; a processor always has."""
+    import torch
+
+    if device.type == "cpu":
+        return lambda: None
+    return lambda: torch.cuda.synchronize(device)
+
+
+def step_in_parts(learner: Learner) -> None:
+    """A step whose parts are called one by one, also where a GPU would replay it as one graph."""
+    learner.update(look=None if learner.device.type == "cpu" else lambda made: None)
+
+
 def count_flops(learner: Learner) -> dict[str, int]:
     """FLOPs of the matrix products of one step, by part."""
     from torch.utils._python_dispatch import TorchDispatchMode
@@ -187,7 +213,7 @@ def count_flops(learner: Learner) -> dict[str, int]:
     with Counter() as counter:  # type: ignore[no-untyped-call]
         stopwatch = Stopwatch(lambda: counter.flops)
         with watched(learner, stopwatch):
-            learner.update()
+            step_in_parts(learner)
             stopwatch.edge()
     return dict(stopwatch.flops)
 
@@ -195,13 +221,13 @@ def count_flops(learner: Learner) -> dict[str, int]:
 def measure(learner: Learner, steps: int) -> dict[str, Part]:
     """The parts of a step, those that take longest first."""
     for _ in range(WARM_UP):
-        learner.update()
-    flops, stopwatch = count_flops(learner), Stopwatch()
+        step_in_parts(learner)
+    flops, stopwatch = count_flops(learner), Stopwatch(settle=settling(learner.device))
     taken: list[dict[str, float]] = []
     with watched(learner, stopwatch):
         for _ in range(steps):
             stopwatch.restart()
-            learner.update()
+            step_in_parts(learner)
             stopwatch.edge()
             taken.append(stopwatch.seconds)
     # Other programs only ever make a step slower.
@@ -213,16 +239,34 @@ def measure(learner: Learner, steps: int) -> dict[str, Part]:
     }
 
 
-def peak_flops(precision: Precision = "float32") -> float:
-    """FLOPs a second of a large matrix product, with as many threads as are set."""
+def whole_rate(learner: Learner, steps: int) -> float:
+    """Steps a second as training takes them, one after the other."""
+    settle = settling(learner.device)
+    # A GPU records the step once it has taken a few.
+    for _ in range(2 * WARM_UP):
+        learner.update()
+    settle()
+    start = time.perf_counter()
+    for _ in range(steps):
+        learner.update()
+    settle()
+    return steps / (time.perf_counter() - start)
+
+
+def peak_flops(precision: Precision = "float32", device: torch.device | None = None) -> float:
+    """FLOPs a second of a large matrix product on a device, with as many threads as are set."""
     import torch
 
+    device = device or torch.device("cpu")
+    settle = settling(device)
     a = torch.randn(PEAK_SIZE, PEAK_SIZE, generator=torch.Generator().manual_seed(0))
-    a = a.to(getattr(torch, precision))
+    a = a.to(device, getattr(torch, precision))
     out, best = torch.empty_like(a), float("inf")
     for _ in range(PEAK_TIMES):
+        settle()
         start = time.perf_counter()
         torch.mm(a, a, out=out)
+        settle()
         best = min(best, time.perf_counter() - start)
     return float(2 * PEAK_SIZE**3 / best)
 
@@ -285,6 +329,7 @@ def profile(options: ProfileConfig, console: Console) -> None:
     if options.trace is not None and not options.trace.absolute().parent.is_dir():
         raise UsageError(f"--trace {options.trace}: there is no folder {options.trace.parent}")
     words = ["--env", options.env, "--method", options.method, "--preset", options.preset]
+    words += ["--device", options.device]
     if options.precision is not None:
         words += ["--precision", options.precision]
     config = dataclasses.replace(parse(words), data=options.data, threads=options.threads)
@@ -295,20 +340,24 @@ def profile(options: ProfileConfig, console: Console) -> None:
     if isinstance(codebook := getattr(learner.method, "codebook", None), torch.nn.Module):
         codebook.placed.fill_(True)  # type: ignore[operator]
     parts = measure(learner, options.steps)
-    peak = peak_flops(learner.precision)
+    peak = peak_flops(learner.precision, learner.device)
     console.print(table_of(parts, peak))
     threads = f"{options.threads} thread" + "s" * (options.threads > 1)
+    where = threads if learner.device.type == "cpu" else options.device
     console.print(
         f"{config.env}, {config.method}, {config.preset}: "
         f"{1 / sum(part.seconds for part in parts.values()):.1f} steps/s; "
-        f"peak {peak / 1e9:.0f} GFLOP/s in {learner.precision}, {threads}.",
+        f"peak {peak / 1e9:.0f} GFLOP/s in {learner.precision}, {where}.",
         soft_wrap=True,
         highlight=False,
     )
+    if learner.device.type != "cpu":
+        rate = whole_rate(learner, options.steps)
+        console.print(f"As one CUDA graph: {rate:.1f} steps/s.", highlight=False)
     if options.trace is not None:
         with traced() as trace, watched(learner, Stopwatch()):
             for _ in range(TRACED):
-                learner.update()
+                step_in_parts(learner)
         trace.export_chrome_trace(str(options.trace))
         console.print(f"Trace of {TRACED} steps: {options.trace}", soft_wrap=True)
 

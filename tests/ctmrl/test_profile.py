@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 from torch import nn
 
@@ -22,6 +23,7 @@ from ctmrl.networks import Critic
 from ctmrl.presets import preset
 from ctmrl.profile import (
     REST,
+    WARM_UP,
     Part,
     ProfileConfig,
     Stopwatch,
@@ -32,9 +34,12 @@ from ctmrl.profile import (
     profile,
     table_of,
     watched,
+    whole_rate,
 )
+from datagen.accelerator import WARM_UP as RECORDED_AFTER
 from tests.ctmrl.commands import Commands
 from tests.ctmrl.examples import smoke, with_dual_steps
+from tests.datagen.tape import pretend_cuda
 
 
 @pytest.fixture
@@ -123,6 +128,30 @@ def test_the_flops_of_the_dual_critics_steps(wind_data: OfflineData) -> None:
     assert flops["actor, forward"] == 3 * 2 * rows * weights(actor_critic.actor)
 
 
+def test_on_a_gpu_a_step_is_measured_in_parts_and_as_a_recording(
+    learner: Learner, wind_data: OfflineData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the stand-in for a GPU's graphs: what is replayed has no parts."""
+    said = pretend_cuda(monkeypatch)
+    waited: list[torch.device] = []
+    monkeypatch.setattr(torch.cuda, "synchronize", waited.append)
+    recorded = Learner(smoke(steps=1_000), wind_data)
+    recorded.record()
+    recorded.device = torch.device("cuda:1")
+    parts, wanted = measure(recorded, 3), count_flops(learner)
+    assert {name: part.flops for name, part in parts.items()} == wanted
+    assert "replay" not in said
+    # At every edge of a part, or its time would be that of what came before it.
+    assert len(waited) >= 3 * 2 * len(parts)
+    assert {*waited} == {recorded.device}
+    del waited[:]
+    before = recorded.step
+    assert whole_rate(recorded, 7) > 0
+    assert recorded.step - before == 7 + 2 * WARM_UP
+    assert said.count("replay") == 7 + 2 * WARM_UP - RECORDED_AFTER
+    assert len(waited) == 2
+
+
 def test_the_table_fits_a_terminal_and_adds_up() -> None:
     parts = {"backward": Part(3e-3, 6_000_000_000), "target value, forward": Part(1e-3, 0)}
     text = show(table_of(parts, peak=4e12))
@@ -193,6 +222,7 @@ def test_random_numbers_are_enough_for_the_contexts(
         (ProfileConfig(env="windy"), "no environment 'windy'"),
         (ProfileConfig(method="ctrml"), "did you mean 'ctmrl'?"),
         (ProfileConfig(preset="big"), "no preset 'big'"),
+        (ProfileConfig(device="tpu"), "--device tpu cannot be used here: learning is on cpu or"),
         (ProfileConfig(trace=Path("nowhere/trace.json")), "there is no folder nowhere"),
         (ProfileConfig(data=Path("nowhere")), "nowhere"),
     ],
