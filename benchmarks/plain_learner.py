@@ -246,8 +246,12 @@ class PlainLearner:
 
     def sample_actions(self, obs: Tensor, z: Tensor) -> Sampled:
         """Actions that the policy draws."""
-        mean, log_std = self.networks["actor"](obs, z).chunk(2, dim=-1)
-        log_std = log_std.clamp(-20.0, 0.0)
+        mean, free = self.networks["actor"](obs, z).chunk(2, dim=-1)
+        log_std = free + (free.clamp(-20.0, 0.0) - free).detach()
+        if free.requires_grad:  # outside the bounds, only gradients that lead back inside
+            above, below = free > 0, free < -20
+            free.register_hook(lambda g: torch.where(above, g.clamp(min=0), g))
+            free.register_hook(lambda g: torch.where(below, g.clamp(max=0), g))
         noise = torch.randn(mean.shape, generator=self.generator)
         drawn = torch.tanh(mean + log_std.exp() * noise)
         density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ctmrl.bounds import bounded
 from ctmrl.numbers import Source, normal
 from ctmrl.precision import lowered
 
@@ -235,7 +236,7 @@ class ActionSample(NamedTuple):
         action: tanh(mean + std * noise), [*, A].
         log_prob: log density of the action, [*].
         mean: before the tanh, [*, A].
-        log_std: clamped, [*, A].
+        log_std: within LOG_STD_RANGE, [*, A].
     """
 
     action: Tensor
@@ -272,10 +273,10 @@ class Actor(nn.Module):
         self.net = mlp(len(statistics[0]) + z_dim, hidden, 2 * act_dim)
 
     def forward(self, obs: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean before the tanh and clamped log standard deviation, each [*, A]."""
+        """Mean before the tanh and bounded log standard deviation, each [*, A]."""
         out = self.net(torch.cat([self.standardize(obs), z], dim=-1))
         mean, log_std = out.chunk(2, dim=-1)
-        return mean, log_std.clamp(*LOG_STD_RANGE)
+        return mean, bounded(log_std, *LOG_STD_RANGE)
 
     def sample(self, obs: Tensor, z: Tensor, generator: Source) -> ActionSample:
         """Draw actions [*, A] for observations [*, O] and contexts [*, Z]."""
