@@ -104,12 +104,14 @@ class RunConfig:
 
     @property
     def label(self) -> str:
-        """The method, and the slice of the data where that is not all of it: a report's rows."""
+        """The method, with the slice of the data or the split that is its own: a report's rows."""
         words = [self.method]
         if self.quality != "mixed":
             words.append(self.quality)
         if self.data_episodes is not None:
             words.append(f"{self.data_episodes}-episodes")
+        if self.validate:
+            words.append("validation")
         return "-".join(words)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +19,8 @@ from datagen.dataset import DatasetError
 
 MISTAKES = (UsageError, DatasetError, OSError)
 """Errors whose message is the sentence a user needs: their own mistake, or a disk's refusal."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""A disk's refusals that end when there is room."""
 
 KINDS = {
     "return": "return",
@@ -50,7 +53,9 @@ def run_command(command: Callable[[], None], stopped: str = RESUMES) -> int:
         sys.stderr.write(f"{stopped}\n")
         return 130
     except MISTAKES as error:
-        sys.stderr.write(f"error: {error}\n")
+        full = isinstance(error, OSError) and error.errno in NO_ROOM
+        way_on = "; nothing written before is lost: make room and give the same command again"
+        sys.stderr.write(f"error: {error}{way_on if full else ''}\n")
         return 1 if isinstance(error, Diverged) else 2
     return 0
 

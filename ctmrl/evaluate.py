@@ -45,8 +45,8 @@ class EvaluateConfig:
     """Of exploration and of the offline contexts, and of the fresh tasks; the run's own seed by
     default."""
     out: Path | None = None
-    """Also write the result as JSON and its pictures into this folder; with several protocols, into
-    a sub-folder for each, named after it."""
+    """Also write the result as JSON, its pictures and the run's settings into this folder; with
+    several protocols, into a sub-folder for each, named after it."""
     repetitions: int | None = field(default=None)
     """Independent adaptations of each task; the run's own number by default."""
     unfinished: bool = False
@@ -233,9 +233,25 @@ def _groups(stored: dict[str, Any], tasks: TaskSet) -> dict[str, NDArray[np.int6
     for name, rows in stored["groups"].items():
         if name not in ("unseen", "seen"):
             raise ValueError(f"groups.{name} is neither of unseen nor of seen tasks")
-        if not rows or not all(isinstance(row, int) and 0 <= row < len(tasks) for row in rows):
+        if not rows or not all(type(row) is int and 0 <= row < len(tasks) for row in rows):
             raise ValueError(f"groups.{name} is not of tasks from 0 to {len(tasks) - 1}")
+    if not stored["groups"]:
+        raise ValueError("groups has none")
     return {name: np.array(rows) for name, rows in stored["groups"].items()}
+
+
+def _write(record: dict[str, Any], stored: dict[str, Any], folder: Path) -> None:
+    """Write an evaluation, last, so that where it is, all that stands beside it is of it."""
+    from ctmrl.report import write_pictures
+    from ctmrl.runs import EVALUATION, to_json
+    from ctmrl.settings import SETTINGS_FILE
+    from datagen.dataset import write_whole
+
+    (folder / EVALUATION).unlink(missing_ok=True)
+    of_run = {name: stored[name] for name in ("dataset", "settings")}
+    write_whole(folder / SETTINGS_FILE, to_json(of_run))
+    write_pictures(record, folder)
+    write_whole(folder / EVALUATION, to_json(record))
 
 
 def main(config: EvaluateConfig) -> None:
@@ -252,9 +268,8 @@ def main(config: EvaluateConfig) -> None:
     from ctmrl.methods.base import Dimensions
     from ctmrl.offline import offline_contexts
     from ctmrl.presets import config_from_settings
-    from ctmrl.report import result_table, write_pictures
+    from ctmrl.report import result_table
     from ctmrl.threads import settle_threads
-    from datagen.dataset import write_whole
     from meta_envs import task_set
 
     folders = _folders(config)
@@ -298,10 +313,10 @@ def main(config: EvaluateConfig) -> None:
     for protocol, record in records.items():
         if step < dims.steps:
             record["step"] = step
+            record["method"] += f", step {step} of {dims.steps}"
         console.print(result_table(record))
         if folder := folders.get(protocol):
-            write_whole(folder / runs.EVALUATION, runs.to_json(record))
-            write_pictures(record, folder)
+            _write(record, stored, folder)
 
 
 if __name__ == "__main__":

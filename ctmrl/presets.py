@@ -284,11 +284,19 @@ def config_from_settings(stored: dict[str, Any], path: Path) -> RunConfig:
 
 
 def _restored(base: Any, values: dict[str, Any]) -> Any:
-    """`base` with its fields taken from JSON, where tuples have become lists."""
+    """`base` with its fields taken from JSON, where tuples have become lists.
+
+    Raises:
+        TypeError: a value has a type that its field has not.
+    """
     found: dict[str, Any] = {}
-    for key, value in values.items():
-        if dataclasses.is_dataclass(getattr(base, key, None)):
-            found[key] = _restored(getattr(base, key), value)
-        else:
-            found[key] = tuple(value) if isinstance(value, list) else value
+    for key, stored in values.items():
+        default = getattr(base, key, None)
+        if dataclasses.is_dataclass(default):
+            found[key] = _restored(default, stored)
+            continue
+        value = found[key] = tuple(stored) if isinstance(stored, list) else stored
+        kinds = (int, float) if isinstance(default, float) else type(default)
+        if default is not None and not isinstance(value, kinds):
+            raise TypeError(f"{key} is {stored!r}")
     return dataclasses.replace(base, **found)

@@ -328,6 +328,8 @@ def profile(options: ProfileConfig, console: Console) -> None:
     check_settings(options)
     if options.trace is not None and not options.trace.absolute().parent.is_dir():
         raise UsageError(f"--trace {options.trace}: there is no folder {options.trace.parent}")
+    if options.trace is not None and options.trace.is_dir():
+        raise UsageError(f"--trace {options.trace} is a folder: give the name of a file")
     words = ["--env", options.env, "--method", options.method, "--preset", options.preset]
     words += ["--device", options.device]
     if options.precision is not None:

@@ -96,12 +96,13 @@ def result_table(record: dict[str, Any]) -> Table:
 
 
 def write_pictures(record: dict[str, Any], folder: Path) -> None:
-    """Write adaptation.png, unless there was no exploration, and contexts.png into a folder."""
+    """Write adaptation.png, gone where there was no exploration, and contexts.png into a folder."""
     from datagen.dataset import write_whole
 
     pictures = {"adaptation.png": adaptation_figure, "contexts.png": context_figure}
     if all(len(group["curve"]) == 1 for group in record["groups"].values()):
         del pictures["adaptation.png"]
+        (folder / "adaptation.png").unlink(missing_ok=True)
     for name, draw in pictures.items():
         buffer = BytesIO()
         # Without a version in it, so that equal results give equal bytes.
@@ -169,19 +170,22 @@ def context_figure(record: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(11 if has_codes else 5.6, 4.8), layout="constrained")
     all_axes = figure.subplots(1, 2 if has_codes else 1, squeeze=False)[0]
     value, title = _parameter(record["param_names"], params)
-    panels = [(value, "twilight" if np.ptp(value) > 200 else "viridis", title)]
+    # Angles that go round are coloured round: the whole turn, whatever part of it is there.
+    turn = title.endswith("degrees") and np.ptp(value) > 200
+    limits = (-180.0, 180.0) if turn else _limits(value)
+    panels = [(value, "twilight" if turn else "viridis", limits, title)]
     if has_codes:
         codes = np.concatenate([np.array(group["codes"]) for group in groups.values()])
-        panels.append((codes, "tab20", f"code ({len(np.unique(codes))} in use)"))
-    for axes, (values, colors, label) in zip(all_axes, panels, strict=True):
+        panels.append((codes, "tab20", _limits(codes), f"code ({len(np.unique(codes))} in use)"))
+    for axes, (values, colors, (low, high), label) in zip(all_axes, panels, strict=True):
         for name, part in zip(groups, parts, strict=True):
             drawn = axes.scatter(
                 points[part, 0],
                 points[part, 1],
                 c=values[part],
                 cmap=colors,
-                vmin=values.min(),
-                vmax=max(values.max(), values.min() + 1),
+                vmin=low,
+                vmax=high,
                 marker="o" if name == "seen" else "*",
                 s=45 if name == "seen" else 150,
                 edgecolors="0.2",
@@ -196,6 +200,11 @@ def context_figure(record: dict[str, Any]) -> Figure:
             figure.colorbar(drawn, ax=axes, label=label)
     figure.suptitle(f"{record['env']}: contexts after adaptation, {record['method']}")
     return figure
+
+
+def _limits(values: NDArray[Any]) -> tuple[float, float]:
+    """Ends of a colour bar, apart also where all values are one."""
+    return float(values.min()), float(max(values.max(), values.min() + 1))
 
 
 def _parameter(names: list[str], params: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ctmrl.errors import UsageError
 from ctmrl.settings import LATER_SETTINGS, with_later_settings
-from datagen.dataset import write_whole
+from datagen.dataset import naming, write_whole
 
 CONFIG, METRICS, CHECKPOINT, EVALUATION, LOGGERS = (
     "config.json",
@@ -60,16 +60,23 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise RunError(
             f"{path.parent} is not a run's folder: it has no {path.name}; "
             "python -m ctmrl.train makes one"
         ) from None
     except (OSError, ValueError) as error:
-        raise RunError(f"{path} cannot be read ({error}): train again with --restart") from None
+        raise RunError(f"{path} cannot be read ({error}): {_instead_of(path)}") from None
     if not isinstance(content, dict):
-        raise RunError(f"{path} is not of a run: train again with --restart")
+        raise RunError(f"{path} is not of a run: {_instead_of(path)}")
     return content
+
+
+def _instead_of(path: Path) -> str:
+    """What to do where a file of a run is of no use."""
+    if path.name == EVALUATION:
+        return "delete it and give the same command again"
+    return "train again with --restart"
 
 
 def load_checkpoint(path: Path) -> dict[str, Tensor]:
@@ -102,10 +109,8 @@ def fitting(path: Path) -> Iterator[None]:
     except UsageError:
         raise
     except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RunError(
-            f"{path} does not fit its run ({reason}): train again with --restart"
-        ) from None
+        reason = " ".join(str(error).split()[:24]) or type(error).__name__
+        raise RunError(f"{path} does not fit its run ({reason}): {_instead_of(path)}") from None
 
 
 def begun_with(path: Path, name: str) -> Any:
@@ -299,22 +304,27 @@ class RunFolder:
         """Forget the metrics of steps after `step`, which will be taken again.
 
         Raises:
-            RunError: the file is damaged.
+            RunError: the file is damaged, or lacks the row of that step.
         """
         path = self.path / METRICS
-        if not path.exists():
-            return
         try:
-            lines = path.read_text().split("\n")[:-1]
-            kept = [line for line in lines[1:] if int(line.partition(",")[0]) <= step]
+            lines = path.read_text().split("\n")[:-1] if path.exists() else []
+            steps = [int(line.partition(",")[0]) for line in lines[1:]]
         except ValueError as error:
             raise RunError(f"{path} is damaged ({error}): train again with --restart") from None
-        write_whole(path, "".join(f"{line}\n" for line in [*lines[:1], *kept]).encode())
+        kept = [line for line, of in zip(lines[1:], steps, strict=True) if of <= step]
+        if step and step not in steps:
+            raise RunError(
+                f"{path} has no row of step {step}, which {CHECKPOINT} is of: "
+                "put it back, or train again with --restart"
+            )
+        if path.exists():
+            write_whole(path, "".join(f"{line}\n" for line in [*lines[:1], *kept]).encode())
 
     def append_metrics(self, row: dict[str, float | None]) -> None:
         """Add a row; the first one's keys are the columns, also for a later version's rows."""
         path = self.path / METRICS
-        with path.open("a+", newline="") as file:
+        with naming(path), path.open("a+", newline="") as file:
             file.seek(0)
             columns = next(csv.reader(file), None)
             writer = csv.DictWriter(

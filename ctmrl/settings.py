@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+SETTINGS_FILE = "settings.json"
+"""Beside an evaluation outside its run's folder: the settings and the dataset of the run."""
 LATER_SETTINGS: dict[str, Any] = {
     "quality": "mixed",
     "data_episodes": None,

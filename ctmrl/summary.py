@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctmrl.errors import UsageError
-from ctmrl.settings import with_later_settings
+from ctmrl.settings import SETTINGS_FILE, with_later_settings
 
 RESAMPLES = 10_000
 APART = ("seed", "threads", "device")
@@ -64,8 +64,10 @@ def find_records(paths: list[Path]) -> list[dict[str, Any]]:
     """
     files = sorted({file for path in paths for file in path.glob("**/evaluation.json")})
     if not files:
-        where = ", ".join(map(str, paths))
-        raise UsageError(f"no finished run in {where}: python -m ctmrl.train makes one")
+        where = ", ".join(map(str, paths)) or "no folder"
+        raise UsageError(
+            f"no finished run in {where}: name folders that python -m ctmrl.train made"
+        )
     records = []
     for file in files:
         try:
@@ -76,24 +78,28 @@ def find_records(paths: list[Path]) -> list[dict[str, Any]]:
             raise UsageError(
                 f"{file} is not an evaluation of a run ({error}): move it away"
             ) from None
-        record["settings"] = _settings(file.with_name("config.json"))
+        record["settings"] = _settings(file.parent)
         records.append(record)
     return records
 
 
-def _settings(file: Path) -> dict[str, Any]:
-    """What a run's result depends on beside its seed, by name; empty without a run's config.
+def _settings(folder: Path) -> dict[str, Any]:
+    """What a result depends on beside its seed, by name; empty where its folder does not have it.
 
     Raises:
         UsageError: it cannot be read.
     """
-    if not file.exists():
+    names = (folder / name for name in ("config.json", SETTINGS_FILE))
+    file = next((one for one in names if one.exists()), None)
+    if file is None:
         return {}
     try:
         config = json.loads(file.read_bytes())
         settings = {"dataset": config["dataset"], **with_later_settings(config["settings"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{file} is not a run's config ({error}): move its run away") from None
+        raise UsageError(
+            f"{file} does not have a run's settings ({error}): move its folder away"
+        ) from None
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         flat |= value if isinstance(value, dict) else {name: value}
@@ -122,7 +128,7 @@ def collate(records: list[dict[str, Any]]) -> list[Result]:
     results = []
     for (env, method, group), members in rows.items():
         members.sort(key=lambda record: int(record["seed"]))
-        # All pairs: a run without a config.json fits those beside it whatever they are.
+        # All pairs: one whose settings are not known fits those beside it whatever they are.
         for one, other in combinations(members, 2):
             _check_fit(one, other, group)
         groups = [member["groups"][group] for member in members]

@@ -205,8 +205,7 @@ def _way_on(folder: RunFolder) -> str:
 
 def default_folder(config: RunConfig) -> Path:
     """runs/<env>/<method>/seed-<n>, beside it for runs that must not be mistaken for those."""
-    name = f"{config.label}-validation" if config.validate else config.label
-    return Path("runs") / config.env / name / f"seed-{config.seed}"
+    return Path("runs") / config.env / config.label / f"seed-{config.seed}"
 
 
 def _meta_train(

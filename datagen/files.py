@@ -8,7 +8,8 @@ import os
 import platform
 import shlex
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +211,21 @@ def partial_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.{machine()}.{os.getpid()}.partial")
 
 
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an OSError name the file: one of a handle, such as a full disk's, does not.
+
+    Raises:
+        OSError: what it was.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is whole or absent, whatever happens in between.
 
@@ -218,7 +234,7 @@ def write_whole(path: Path, content: bytes) -> None:
     """
     partial = partial_of(path)
     try:
-        with partial.open("wb") as file:
+        with naming(path), partial.open("wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())

@@ -199,9 +199,10 @@ def test_the_command(method: str, wind_path: Path, commands: Commands, tmp_path:
         assert not scored.exists()
         return
     assert code == 0, commands.output()
-    assert f"{method}, codes, seed 0" in commands.output()
+    assert f"{method}-validation, codes, seed 0" in commands.output()
     record = json.loads((scored / "evaluation.json").read_text())
     wanted = {"name": "codes", "random_episodes": 0, "code_episodes": 2, "policy_episodes": 2}
     assert record["protocol"].items() >= wanted.items()
     assert {len(group["curve"]) for group in record["groups"].values()} == {5}
-    assert sorted(contents(scored)) == ["adaptation.png", "contexts.png", "evaluation.json"]
+    files = ["adaptation.png", "contexts.png", "evaluation.json", "settings.json"]
+    assert sorted(contents(scored)) == files

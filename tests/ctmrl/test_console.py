@@ -44,7 +44,13 @@ def failing(error: BaseException) -> None:
         (
             OSError(errno.ENOSPC, "No space left on device", "runs/x"),
             2,
-            "error: [Errno 28] No space left on device: 'runs/x'\n",
+            "error: [Errno 28] No space left on device: 'runs/x'; nothing written before is lost: "
+            "make room and give the same command again\n",
+        ),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "runs/x"),
+            2,
+            "error: [Errno 13] Permission denied: 'runs/x'\n",
         ),
         (KeyboardInterrupt(), 130, "Stopped. The same command goes on from the last checkpoint.\n"),
     ],

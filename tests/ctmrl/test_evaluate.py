@@ -49,6 +49,9 @@ def test_a_stored_run_repeats_its_training_commands_evaluation(
     words = ("ctmrl.evaluate", str(finished_run.path), "--out", str(tmp_path / "again"))
     assert commands.run(*words) == 0, commands.output()
     found = contents(tmp_path / "again")
+    config = json.loads(before["config.json"])
+    wanted = {name: config[name] for name in ("dataset", "settings")}
+    assert json.loads(found.pop("settings.json")) == wanted
     assert sorted(found) == ["adaptation.png", "contexts.png", "evaluation.json"]
     assert found == {name: before[name] for name in found}
     assert contents(finished_run.path) == before
@@ -260,6 +263,8 @@ def test_a_config_of_another_version(
         ("groups", {"foo": [1]}, "groups.foo is neither of unseen nor of seen tasks"),
         ("groups", {"unseen": []}, "groups.unseen is not of tasks from 0 to 49"),
         ("dimensions", {"obs": 2, "act": 2, "tasks": 7, "steps": "x"}, "invalid literal for int()"),
+        ("groups", {}, "groups has none"),
+        ("groups", {"unseen": [True]}, "groups.unseen is not of tasks from 0 to "),
     ],
 )
 def test_a_damaged_config(
@@ -272,11 +277,24 @@ def test_a_damaged_config(
     assert said.endswith("): train again with --restart")
 
 
-def test_a_setting_of_a_wrong_type(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("part", "name", "wrong"),
+    [
+        ("training", "steps", "many"),
+        ("meta_test", "repetitions", 1.5),
+        ("context", "z_dim", None),
+        ("actor_critic", "hidden", 64),
+    ],
+)
+def test_a_setting_of_a_wrong_type(
+    part: str, name: str, wrong: Any, copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     stored = read_json(copy / "config.json")
-    stored["settings"]["training"]["steps"] = "many"
+    stored["settings"][part][name] = wrong
     (copy / "config.json").write_text(json.dumps(stored))
-    assert mistake(capsys, copy).startswith(f"{copy / 'config.json'} does not fit ")
+    said = mistake(capsys, copy)
+    assert said.startswith(f"{copy / 'config.json'} does not fit ")
+    assert f"({name} is {wrong!r})" in said
 
 
 def test_an_output_folder_that_is_a_file(

@@ -96,14 +96,17 @@ def run(wind_path: Path, commands: Commands, tmp_path: Path) -> Path:
 
 
 def test_the_command(run: Path, wind_path: Path, commands: Commands, tmp_path: Path) -> None:
+    # What is in the folder of another evaluation does not stay beside this one.
+    assert commands.run("ctmrl.evaluate", str(run), "--out", str(tmp_path / "a")) == 0
+    assert "adaptation.png" in contents(tmp_path / "a")
     words = ("ctmrl.evaluate", str(run), "--protocols", "offline", "--data", str(wind_path))
     assert commands.run(*words, "--out", str(tmp_path / "a")) == 0, commands.output()
-    assert "ctmrl, offline, seed 0" in commands.output()
+    assert "ctmrl-validation, offline, seed 0" in commands.output()
     assert commands.run(*words, "--out", str(tmp_path / "b")) == 0
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    assert sorted(contents(tmp_path / "a")) == ["contexts.png", "evaluation.json"]
+    assert sorted(contents(tmp_path / "a")) == ["contexts.png", "evaluation.json", "settings.json"]
     record = json.loads((tmp_path / "a" / "evaluation.json").read_text())
-    assert record["method"] == "ctmrl, offline"
+    assert record["method"] == "ctmrl-validation, offline"
     assert record["protocol"]["name"] == "offline"
     assert record["protocol"]["random_episodes"] == record["protocol"]["policy_episodes"] == 0
     assert all(len(group["curve"]) == 1 for group in record["groups"].values())
@@ -115,7 +118,11 @@ def test_all_protocols_in_one_pass(
     words = ("ctmrl.evaluate", str(run), "--data", str(wind_path), "--protocols")
     together, names = tmp_path / "together", ("offline", "np_online", "online", "codes")
     assert commands.run(*words, *names, "--out", str(together)) == 0, commands.output()
-    for title in ("ctmrl, offline, seed 0", "ctmrl, seed 0", "ctmrl, online, seed 0"):
+    for title in (
+        "ctmrl-validation, offline, seed 0",
+        "ctmrl-validation, seed 0",
+        "ctmrl-validation, online, seed 0",
+    ):
         assert title in commands.output()
     returns = set()
     for name in names:
@@ -132,11 +139,11 @@ def test_all_protocols_in_one_pass(
     assert contents(together / "np_online")["evaluation.json"] == trained
     explored = json.loads((together / "online" / "evaluation.json").read_text())["protocol"]
     assert (explored["random_episodes"], explored["policy_episodes"]) == (0, 4)
-    pictures = ["adaptation.png", "contexts.png", "evaluation.json"]
-    assert sorted(contents(together / "online")) == pictures
+    files = ["adaptation.png", "contexts.png", "evaluation.json", "settings.json"]
+    assert sorted(contents(together / "online")) == files
     # A report keeps them apart.
     assert commands.run("ctmrl.report", str(together)) == 0, commands.output()
-    assert "ctmrl, offline" in commands.output()
+    assert "ctmrl-validation, offline" in commands.output()
 
 
 @pytest.mark.parametrize("method", ["oracle_task", "no_context", "focal"])

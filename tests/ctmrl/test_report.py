@@ -201,6 +201,19 @@ def test_tasks_of_many_parameters_are_coloured_by_their_main_direction() -> None
     assert np.corrcoef(colors, line)[0, 1] > 0.99
 
 
+@pytest.mark.parametrize(("ends", "turn"), [((-134.0, 84.0), True), ((0.0, 180.0), False)])
+def test_angles_that_go_round_have_the_colours_of_a_whole_turn(
+    ends: tuple[float, float], turn: bool
+) -> None:
+    shown = record(groups=("fresh",))
+    group = shown["groups"]["fresh"]
+    angles = np.radians(np.linspace(*ends, len(group["tasks"])))
+    group["params"] = np.stack([np.cos(angles), np.sin(angles)], axis=1).tolist()
+    (drawn,) = context_figure(shown).axes[0].collections
+    assert drawn.get_clim() == pytest.approx((-180.0, 180.0) if turn else ends)
+    assert drawn.get_cmap().name == ("twilight" if turn else "viridis")
+
+
 @pytest.mark.parametrize("change", ["fresh", "one parameter", "one task", "no adaptation"])
 def test_records_of_other_shapes_are_drawn(change: str) -> None:
     shown = record(groups=("fresh",))
@@ -294,7 +307,7 @@ def test_a_folder_without_runs_is_one_sentence(
 ) -> None:
     assert run_command(lambda: main(ReportConfig([tmp_path]))) == 2
     assert capsys.readouterr().err == (
-        f"error: no finished run in {tmp_path}: python -m ctmrl.train makes one\n"
+        f"error: no finished run in {tmp_path}: name folders that python -m ctmrl.train made\n"
     )
 
 

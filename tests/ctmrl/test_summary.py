@@ -179,11 +179,20 @@ def test_a_run_without_settings_hides_no_difference(tmp_path: Path) -> None:
         collate(find_records([tmp_path]))
 
 
+def test_evaluations_outside_their_runs_folders_have_its_settings(tmp_path: Path) -> None:
+    for seed, steps in ((0, 60), (1, 70)):
+        write_run(tmp_path, seed, {"training": {"steps": steps}})
+        folder = tmp_path / f"seed-{seed}"
+        (folder / "config.json").rename(folder / "settings.json")
+    with pytest.raises(UsageError, match=r"differ in steps \(60 and 70\): report them apart$"):
+        collate(find_records([tmp_path]))
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"dataset": "abc"}'])
 def test_a_config_that_cannot_be_read_is_named(text: str, tmp_path: Path) -> None:
     write_run(tmp_path, 0, {})
     (tmp_path / "seed-0" / "config.json").write_text(text)
-    said = rf"^{tmp_path}/seed-0/config.json is not a run's config \(.*\): move its run away$"
+    said = r"/seed-0/config.json does not have a run's settings \(.*\): move its folder away$"
     with pytest.raises(UsageError, match=said):
         find_records([tmp_path])
 

@@ -27,7 +27,7 @@ from ctmrl.runs import RunFolder, load_checkpoint, read_json
 from ctmrl.train import parse
 from datagen.dataset import task_file
 from meta_envs import ENVIRONMENTS
-from tests.ctmrl.commands import Commands
+from tests.ctmrl.commands import Commands, contents
 from tests.ctmrl.conftest import FinishedRun
 from tests.ctmrl.examples import smoke
 from tests.datagen.examples import write_dataset
@@ -221,6 +221,27 @@ def test_a_folder_is_refused_before_the_data_are_read(
     assert run_command(command.main) == 0
 
 
+@pytest.mark.parametrize("rows", [None, 0, 20])
+def test_metrics_that_lack_the_checkpoints_row_are_one_sentence(
+    rows: int | None, finished_run: FinishedRun, commands: Commands, tmp_path: Path
+) -> None:
+    path = shutil.copytree(finished_run.path, tmp_path / "copy")
+    (path / "evaluation.json").unlink()
+    whole = (path / "metrics.csv").read_bytes()
+    (path / "metrics.csv").unlink()
+    if rows is not None:
+        (path / "metrics.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:rows]))
+    assert commands.run(*finished_run.words, "--out", str(path)) == 2
+    assert commands.output().splitlines()[-1] == (
+        f"error: {path / 'metrics.csv'} has no row of step 40, which checkpoint.pt is of: "
+        "put it back, or train again with --restart"
+    )
+    # As it says.
+    (path / "metrics.csv").write_bytes(whole)
+    assert commands.run(*finished_run.words, "--out", str(path)) == 0, commands.output()
+    assert contents(path) == contents(finished_run.path)
+
+
 @pytest.mark.parametrize("content", ["{}", '{"groups": [1]}'])
 def test_a_damaged_evaluation_is_one_sentence(
     content: str, finished_run: FinishedRun, commands: Commands, tmp_path: Path
@@ -230,7 +251,7 @@ def test_a_damaged_evaluation_is_one_sentence(
     assert commands.run(*finished_run.words, "--out", str(path)) == 2
     said = commands.output().splitlines()[-1]
     assert said.startswith(f"error: {path / 'evaluation.json'} does not fit its run (")
-    assert said.endswith("): train again with --restart")
+    assert said.endswith("): delete it and give the same command again")
     assert "Traceback" not in commands.output()
 
 

@@ -37,12 +37,12 @@ SIZE = 3_000_000
 
 
 def write_on_full_disk(path: Path) -> None:
-    """Child: write more than the system lets it; exit 7 if that is an OSError."""
+    """Child: write more than the system lets it; exit 7 if that is an OSError that names it."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (SIZE // 2, SIZE // 2))
     try:
         write_whole(path, b"b" * SIZE)
-    except OSError:
-        os._exit(7)
+    except OSError as error:
+        os._exit(7 if error.filename == str(path) else 8)
 
 
 def test_a_killed_writer_leaves_the_file_whole_or_absent(tmp_path: Path) -> None:
