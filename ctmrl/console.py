@@ -54,7 +54,7 @@ def run_command(command: Callable[[], None], stopped: str = RESUMES) -> int:
         return 130
     except MISTAKES as error:
         full = isinstance(error, OSError) and error.errno in NO_ROOM
-        way_on = "; nothing written before is lost: make room and give the same command again"
+        way_on = "; make room and give the same command again"
         sys.stderr.write(f"error: {error}{way_on if full else ''}\n")
         return 1 if isinstance(error, Diverged) else 2
     return 0

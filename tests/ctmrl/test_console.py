@@ -44,7 +44,7 @@ def failing(error: BaseException) -> None:
         (
             OSError(errno.ENOSPC, "No space left on device", "runs/x"),
             2,
-            "error: [Errno 28] No space left on device: 'runs/x'; nothing written before is lost: "
+            "error: [Errno 28] No space left on device: 'runs/x'; "
             "make room and give the same command again\n",
         ),
         (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
@@ -186,7 +186,7 @@ def test_the_sparse_robots_first_episodes_may_act_on_a_code_each() -> None:
 )
 def test_codes_of_standard_paper_and_smoke(env: str, codes: tuple[int, ...], method: str) -> None:
     found = []
-    for name in ("standard", "paper", "smoke"):
+    for name in NAMES:
         context = preset(env, method, known_preset(name)).context
         assert isinstance(context, CTMRLConfig | CTMRLReleasedConfig)
         found.append(context.codes)
@@ -259,3 +259,16 @@ def test_an_unknown_preset_or_environment_is_one_sentence() -> None:
 def test_a_file_of_another_version_is_one_sentence(stored: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=r"^run/config\.json does not fit this version of ctmrl"):
         config_from_settings(stored, PATH)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_numbers_with_a_fraction_are_floats_in_every_preset(env: str, method: str) -> None:
+    """A stored run is refused where its numbers have other kinds than the preset's."""
+    for name in NAMES:
+        config = preset(env, method, name)
+        for part in (config, config.training, config.actor_critic, config.context):
+            hints = get_type_hints(type(part))
+            for field in dataclasses.fields(part):
+                value = getattr(part, field.name)
+                assert hints[field.name] is not float or type(value) is float, field.name

@@ -224,7 +224,7 @@ def test_random_numbers_are_enough_for_the_contexts(
         (ProfileConfig(preset="big"), "no preset 'big'"),
         (ProfileConfig(device="tpu"), "--device tpu cannot be used here: learning is on cpu or"),
         (ProfileConfig(trace=Path("nowhere/trace.json")), "there is no folder nowhere"),
-        (ProfileConfig(trace=Path("/tmp")), "--trace /tmp is a folder: give the name of a file"),
+        (ProfileConfig(trace=Path()), "--trace . is a folder: give the name of a file"),
         (ProfileConfig(data=Path("nowhere")), "nowhere"),
     ],
 )
